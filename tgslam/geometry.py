@@ -1,0 +1,120 @@
+"""Rigid motions in float64. Tangent vectors are (rotation, translation), applied on the left: T <- exp(xi) T."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+_SMALL = 1e-8
+
+
+def hat(vector: ArrayLike) -> Array:
+    """[3] -> the skew matrix [3, 3] with hat(a) @ b = a x b."""
+    x, y, z = np.asarray(vector, np.float64)
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def so3_exp(omega: ArrayLike) -> Array:
+    """Rotation vector [3] in rad -> rotation matrix [3, 3] (Rodrigues)."""
+    omega = np.asarray(omega, np.float64)
+    angle = float(np.linalg.norm(omega))
+    W = hat(omega)
+    if angle < _SMALL:
+        return np.eye(3) + W + 0.5 * W @ W
+    return np.eye(3) + np.sin(angle) / angle * W + (1.0 - np.cos(angle)) / angle**2 * W @ W
+
+
+def so3_log(R: ArrayLike) -> Array:
+    """Rotation matrix [3, 3] -> rotation vector [3] in rad, angle in [0, pi]."""
+    R = np.asarray(R, np.float64)
+    quat = quat_wxyz_from_matrix(R)
+    vector, w = quat[1:], quat[0]
+    length = float(np.linalg.norm(vector))
+    if length < _SMALL:
+        return 2.0 * vector
+    return 2.0 * np.arctan2(length, w) / length * vector
+
+
+def _left_jacobian(omega: Array) -> Array:
+    angle = float(np.linalg.norm(omega))
+    W = hat(omega)
+    if angle < 1e-5:
+        return np.eye(3) + 0.5 * W + W @ W / 6.0
+    return (
+        np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * W + (angle - np.sin(angle)) / angle**3 * W @ W
+    )
+
+
+def se3_exp(xi: ArrayLike) -> Array:
+    """Twist [6] = (rotation rad, translation m) -> transform [4, 4]."""
+    xi = np.asarray(xi, np.float64)
+    T = np.eye(4)
+    T[:3, :3] = so3_exp(xi[:3])
+    T[:3, 3] = _left_jacobian(xi[:3]) @ xi[3:]
+    return T
+
+
+def se3_log(T: ArrayLike) -> Array:
+    """Transform [4, 4] -> twist [6] = (rotation rad, translation m), the inverse of `se3_exp` for angles below pi."""
+    T = np.asarray(T, np.float64)
+    omega = so3_log(T[:3, :3])
+    return np.concatenate([omega, np.linalg.solve(_left_jacobian(omega), T[:3, 3])])
+
+
+def inverse(T: ArrayLike) -> Array:
+    """Inverse of one rigid transform [4, 4] or a stack [..., 4, 4]."""
+    T = np.asarray(T, np.float64)
+    Rt = np.swapaxes(T[..., :3, :3], -1, -2)
+    result = np.zeros_like(T)
+    result[..., :3, :3] = Rt
+    result[..., :3, 3] = -(Rt @ T[..., :3, 3:])[..., 0]
+    result[..., 3, 3] = 1.0
+    return result
+
+
+def orthonormalized(T: ArrayLike) -> Array:
+    """The nearest rigid transform to [4, 4]: removes the rounding that many products leave in the rotation."""
+    T = np.array(T, np.float64)
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    T[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    T[3] = [0.0, 0.0, 0.0, 1.0]
+    return T
+
+
+def quat_wxyz_from_matrix(R: ArrayLike) -> Array:
+    """Rotation matrix [3, 3] -> unit quaternion wxyz [4] with w >= 0 (Shepperd: divides by the largest component)."""
+    R = np.asarray(R, np.float64)
+    trace = np.trace(R)
+    squares = np.array([trace, R[0, 0], R[1, 1], R[2, 2]])
+    largest = int(np.argmax(squares))
+    if largest == 0:
+        quat = np.array([1.0 + trace, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    else:
+        i = largest - 1
+        j, k = (i + 1) % 3, (i + 2) % 3
+        quat = np.empty(4)
+        quat[0] = R[k, j] - R[j, k]
+        quat[1 + i] = 1.0 + R[i, i] - R[j, j] - R[k, k]
+        quat[1 + j] = R[i, j] + R[j, i]
+        quat[1 + k] = R[i, k] + R[k, i]
+    quat /= np.linalg.norm(quat)
+    return quat if quat[0] >= 0 else -quat
+
+
+def matrix_from_quat_wxyz(quat_wxyz: ArrayLike) -> Array:
+    """Quaternions wxyz [..., 4] (any length but zero) -> rotation matrices [..., 3, 3]."""
+    q = np.asarray(quat_wxyz, np.float64)
+    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def transform_points(T_ab: ArrayLike, points_b: ArrayLike) -> Array:
+    """Map points [..., 3] m from frame b to frame a."""
+    T = np.asarray(T_ab, np.float64)
+    return np.asarray(points_b, np.float64) @ T[:3, :3].T + T[:3, 3]

@@ -1,0 +1,93 @@
+"""The Taichi runtime: the one place that starts it and that knows which device the arrays live on."""
+
+from __future__ import annotations
+
+import os
+from enum import Enum
+
+import numpy as np
+import taichi as ti
+from numpy.typing import ArrayLike
+
+from tgslam.errors import DeviceError
+
+
+class Device(Enum):
+    """Where kernels run. `AUTO` is the CPU until the CUDA variants of the kernels have landed."""
+
+    AUTO = "auto"
+    CPU = "cpu"
+    CUDA = "cuda"
+
+
+class _Runtime:
+    device: Device | None = None
+    threads: int = 0
+
+
+def start(device: Device = Device.AUTO, threads: int = 0) -> Device:
+    """Initialise Taichi once a process and return the device in use; later calls must ask for the same one.
+
+    threads: CPU threads, 0 = every core that this process may use. Results do not depend on it.
+    Raises DeviceError when CUDA was asked for and is not available, or when another device is already in use.
+    """
+    wanted = Device.CPU if device is Device.AUTO else device
+    if _Runtime.device is not None:
+        if _Runtime.device is not wanted:
+            raise DeviceError(f"the kernels already run on {_Runtime.device.value}; start a new process to use {wanted.value}")
+        return wanted
+    threads = threads or len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1))
+    ti.init(
+        arch=ti.cuda if wanted is Device.CUDA else ti.cpu,
+        default_ip=ti.i32,
+        default_fp=ti.f32,
+        fast_math=True,
+        offline_cache=True,
+        cpu_max_num_threads=threads,
+        log_level=ti.ERROR,
+    )
+    if wanted is Device.CUDA and ti.cfg.arch != ti.cuda:
+        ti.reset()
+        raise DeviceError("no CUDA device was found; use --device cpu, or check the driver with `nvidia-smi`")
+    _Runtime.device, _Runtime.threads = wanted, threads
+    return wanted
+
+
+def device() -> Device:
+    """The device in use (starts the CPU one if none was chosen)."""
+    return _Runtime.device or start()
+
+
+def empty(shape: tuple[int, ...], dtype: type = np.float32, *, lanes: bool = False) -> np.ndarray:
+    """An uninitialised array on the device: NumPy memory on the CPU (kernels use it in place), `ti.ndarray` under CUDA.
+
+    lanes: the last axis is the 16-wide vector axis of a `Lanes` kernel argument.
+    """
+    if device() is Device.CPU:
+        return np.empty(shape, dtype)
+    element = {np.float32: ti.f32, np.int32: ti.i32}[dtype]
+    if lanes:
+        return ti.ndarray(ti.types.vector(shape[-1], element), shape[:-1])
+    return ti.ndarray(element, shape)
+
+
+def zeros(shape: tuple[int, ...], dtype: type = np.float32, *, lanes: bool = False) -> np.ndarray:
+    """Like `empty`, filled with zeros."""
+    array = empty(shape, dtype, lanes=lanes)
+    array.fill(0)
+    return array
+
+
+def to_device(array: ArrayLike, dtype: type = np.float32) -> np.ndarray:
+    """A host array as a device array: no copy on the CPU if it is contiguous and of that dtype already."""
+    host = np.ascontiguousarray(array, dtype)
+    if device() is Device.CPU:
+        return host
+    result = empty(host.shape, dtype)
+    result.from_numpy(host)  # type: ignore[attr-defined]
+    return result
+
+
+def to_host(array: np.ndarray) -> np.ndarray:
+    """A device array as a NumPy array: the same memory on the CPU, a copy under CUDA."""
+    return array if isinstance(array, np.ndarray) else array.to_numpy()
