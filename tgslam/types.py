@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,3 +58,52 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.timestamps_s)
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """The map's Gaussians as host arrays, one row each (activated values are what `render` uses)."""
+
+    mean: NDArray[np.float32]  # [N, 3] m, world
+    log_scale: NDArray[np.float32]  # [N, 3] log of the standard deviation in m along the local axes
+    quat_wxyz: NDArray[np.float32]  # [N, 4] local to world; any length but zero
+    opacity_logit: NDArray[np.float32]  # [N]
+    colour: NDArray[np.float32]  # [N, 3] RGB (SH degree 0 only, stored as the colour itself)
+    embedding: NDArray[np.float32]  # [N, 3] plane-instance embedding theta, Eq. 1
+    plane_id: NDArray[np.int32]  # [N] -1 = on no plane
+    birth_keyframe: NDArray[np.int32]  # [N] index into the keyframes
+
+    def __len__(self) -> int:
+        return len(self.mean)
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What the map looks like from one pose, as host arrays."""
+
+    colour: FloatImage  # [H, W, 3] RGB over black
+    depth_m: FloatImage  # [H, W] expected depth, divided by opacity; 0 where opacity < 0.5
+    opacity: FloatImage  # [H, W] accumulated alpha in [0, 1]
+
+
+class FrameStatus(Enum):
+    """What became of a frame."""
+
+    INITIAL = "initial"  # the first one: it defines the world frame
+    TRACKED = "tracked"
+    LOST = "lost"  # pose coasted on the motion model
+    SKIPPED = "skipped"  # unusable image; it has no pose
+
+
+@dataclass(frozen=True)
+class FrameReport:
+    """One line of log.jsonl: what `Slam.process_frame` did with a frame."""
+
+    index: int
+    timestamp_s: float
+    status: FrameStatus
+    is_keyframe: bool
+    gaussians: int  # in the map, after the frame
+    stage_s: dict[str, float]  # seconds spent by stage: "track", "map", ...
+    measures: dict[str, float]  # residuals, inlier ratio, condition number, gain, bias, iterations
+    message: str = ""  # why it was skipped or lost
