@@ -1,0 +1,87 @@
+"""From configured or published intrinsics to the pinhole camera of the frames that a source returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tgslam.config.schema import DatasetConfig
+from tgslam.errors import ConfigError
+from tgslam.types import Camera
+
+_DISTORTION_LENGTHS = (4, 5, 8, 12, 14)  # OpenCV's models
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Intrinsics of stored images: px, and OpenCV distortion coefficients (() = none). fy < 0: rows count upwards."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    size: tuple[int, int] | None = None  # width, height that the values are for; None = any
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """The camera matrix [3, 3] px of the stored image, with fy as it is."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def flips_rows(self) -> bool:
+        """Whether rows have to be reversed for a camera with positive fy."""
+        return self.fy < 0
+
+    def camera(self, width: int, height: int) -> Camera:
+        """The camera after undistortion and, for fy < 0, the flip of rows: v' = H - 1 - v, so fy' = -fy."""
+        if self.flips_rows:
+            return Camera(width, height, self.fx, -self.fy, self.cx, height - 1 - self.cy)
+        return Camera(width, height, self.fx, self.fy, self.cx, self.cy)
+
+
+def resolve(config: DatasetConfig, default: Calibration | None, hint: str) -> Calibration:
+    """Configured values where they are set (not 0), else those of `default`.
+
+    The default distortion holds only with the default intrinsics: as soon as one of fx, fy, cx, cy is configured,
+    distortion is what the config says. Raises ConfigError, ending in `hint`, when a value has no default, and for
+    values that no camera has.
+    """
+    given = {key: getattr(config, key) for key in ("fx", "fy", "cx", "cy")}
+    distortion = tuple(float(value) for value in config.distortion)
+    missing = [f"dataset.{key}" for key, value in given.items() if value == 0.0]
+    if default is None:
+        if missing:
+            raise ConfigError(f"the camera is not known: set {', '.join(missing)} (px); {hint}")
+        calibration = Calibration(**given, distortion=distortion)
+    elif len(missing) == len(given):
+        calibration = replace(default, distortion=distortion or default.distortion)
+    else:
+        values = {key: value or getattr(default, key) for key, value in given.items()}
+        calibration = Calibration(**values, distortion=distortion)
+    _check(calibration)
+    return calibration if any(calibration.distortion) else replace(calibration, distortion=())
+
+
+def check_size(calibration: Calibration, width: int, height: int, name: str) -> None:
+    """Raise ConfigError if the calibration was published for images of another size: it is never scaled silently."""
+    if calibration.size not in (None, (width, height)):
+        raise ConfigError(
+            f"{name}: its images are {width}x{height}, but the default camera is for "
+            f"{'x'.join(map(str, calibration.size or ()))}; set dataset.fx, dataset.fy, dataset.cx, dataset.cy (px)"
+        )
+
+
+def _check(calibration: Calibration) -> None:
+    numbers = (calibration.fx, calibration.fy, calibration.cx, calibration.cy, *calibration.distortion)
+    if not np.isfinite(numbers).all():
+        raise ConfigError("dataset.fx, fy, cx, cy and distortion must be finite numbers")
+    if calibration.fx <= 0:
+        raise ConfigError(f"dataset.fx is {calibration.fx:g}, but it must be positive (px)")
+    if calibration.distortion and len(calibration.distortion) not in _DISTORTION_LENGTHS:
+        raise ConfigError(
+            f"dataset.distortion has {len(calibration.distortion)} values; OpenCV's models have "
+            f"{', '.join(map(str, _DISTORTION_LENGTHS))} (k1, k2, p1, p2, k3, ...)"
+        )

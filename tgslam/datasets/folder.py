@@ -1,0 +1,107 @@
+"""A source over image files: pairs of colour and depth images, one camera, an optional ground truth file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tgslam.config.schema import DatasetConfig
+from tgslam.datasets import images
+from tgslam.datasets.calibration import Calibration, check_size
+from tgslam.datasets.groundtruth import read_groundtruth
+from tgslam.datasets.lists import ImagePair
+from tgslam.errors import DatasetError, FrameError
+from tgslam.types import Camera, Frame, Trajectory
+
+
+class FolderSource:
+    """RGB-D frames from image files; it keeps their paths and nothing else of them."""
+
+    def __init__(
+        self,
+        name: str,
+        pairs: list[ImagePair],
+        calibration: Calibration,
+        config: DatasetConfig,
+        groundtruth: Path | None,
+    ) -> None:
+        """Reads colour images until one tells the image size.
+
+        Raises DatasetError if there is none, and ConfigError if the calibration is for images of another size.
+        """
+        width, height = _image_size(name, pairs)
+        check_size(calibration, width, height, name)
+        self._name = name
+        self._camera = calibration.camera(width, height)
+        self._pairs = pairs
+        self._config = config
+        self._groundtruth = groundtruth
+        self._flips_rows = calibration.flips_rows
+        self._undistorter = (
+            images.Undistorter(width, height, calibration.matrix, calibration.distortion)
+            if calibration.distortion
+            else None
+        )
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self._name
+
+    @property
+    def camera(self) -> Camera:
+        """The camera after undistortion and flip."""
+        return self._camera
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def read(self, index: int) -> Frame:
+        """Decode frame `index`, undistort it and flip its rows where the format asks for it.
+
+        Raises FrameError for images that are missing, damaged, of the wrong kind or size, or without any depth in
+        the configured range, and IndexError outside 0 <= index < len(self).
+        """
+        if not 0 <= index < len(self._pairs):
+            raise IndexError(f"frame {index} of {self._name}: it has frames 0 to {len(self._pairs) - 1}")
+        pair = self._pairs[index]
+        rgb, raw = images.read_colour(pair.colour), images.read_raw_depth(pair.depth)
+        self._check_sizes(pair, rgb.shape[:2], raw.shape)
+        if self._undistorter is not None:
+            rgb, raw = self._undistorter.colour(rgb), self._undistorter.depth(raw)
+        if self._flips_rows:
+            rgb, raw = rgb[::-1], raw[::-1]
+        config = self._config
+        depth_m = images.depth_in_metres(raw, config.depth_scale, config.min_depth_m, config.max_depth_m)
+        if not depth_m.any():
+            raise FrameError(
+                f"{pair.depth}: no pixel has a depth from {config.min_depth_m:g} to {config.max_depth_m:g} m; "
+                "if all frames say so, check dataset.depth_scale"
+            )
+        return Frame(index, pair.timestamp_s, images.colour_as_float(rgb), depth_m)
+
+    def groundtruth(self) -> Trajectory | None:
+        """Camera-to-world poses from the ground truth file, or None without one. Raises DatasetError."""
+        return None if self._groundtruth is None else read_groundtruth(self._groundtruth)
+
+    def _check_sizes(self, pair: ImagePair, colour: tuple[int, ...], depth: tuple[int, ...]) -> None:
+        if colour != depth:
+            raise FrameError(
+                f"{pair.depth}: depth is {depth[1]}x{depth[0]}, but its colour image is {colour[1]}x{colour[0]}; "
+                "register depth to colour first"
+            )
+        expected = (self._camera.height, self._camera.width)
+        if colour != expected:
+            raise FrameError(f"{pair.colour}: {colour[1]}x{colour[0]}, but the sequence is {expected[1]}x{expected[0]}")
+
+
+def _image_size(name: str, pairs: list[ImagePair]) -> tuple[int, int]:
+    """Width and height of the first colour image that can be read."""
+    first_error = ""
+    for pair in pairs:
+        try:
+            height, width = images.read_colour(pair.colour).shape[:2]
+        except FrameError as error:
+            first_error = first_error or str(error)
+        else:
+            return width, height
+    raise DatasetError(f"{name}: none of its {len(pairs)} colour images can be read; the first: {first_error}")

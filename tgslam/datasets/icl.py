@@ -1,0 +1,47 @@
+"""ICL-NUIM folders in the TUM-compatible PNG layout: an association file with image numbers in place of times.
+
+Handedness. ICL-NUIM publishes fy = -480: image rows count downwards, the camera's y axis points up, so its frame (x
+right, y up, z forward) and its world are left-handed. Reversing the rows of each image gives, with the same numbers, a
+camera with fy = +480 whose y axis runs with the rows: pixel, depth and published pose then agree in right-handed
+arithmetic, and what is reconstructed is the office as in a mirror. The published poses need no change: their rotations
+are proper, back-projected depth of distant frames coincides under them, and a trajectory estimated from the flipped
+images aligns with the raw file by a rigid motion. Leaving the rows as they are and taking fy = +480 does neither.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tgslam.config.schema import DatasetConfig
+from tgslam.datasets.calibration import Calibration, resolve
+from tgslam.datasets.folder import FolderSource
+from tgslam.datasets.lists import ASSOCIATION_FILES, find_association_file, pairs_from_associations
+from tgslam.errors import DatasetError
+
+_CALIBRATION = Calibration(481.2, -480.0, 319.5, 239.5, (), (640, 480))
+
+
+def open_icl(folder: Path, config: DatasetConfig) -> FolderSource:
+    """Open a sequence folder. `Frame.timestamp_s` is the image number, as in the published ground truth's rows.
+
+    The ground truth, optional, is `groundtruth.txt` or a single `*.gt.freiburg`. Raises DatasetError for a missing or
+    unusable association file, and ConfigError for a camera that cannot be.
+    """
+    associations = find_association_file(folder)
+    if associations is None:
+        advice = (
+            "it has an rgb.txt: try dataset.format=tum"
+            if (folder / "rgb.txt").is_file()
+            else "get the sequence in its TUM-compatible PNG form"
+        )
+        raise DatasetError(f"{folder}: found none of {', '.join(ASSOCIATION_FILES)} for dataset.format=icl; {advice}")
+    pairs = pairs_from_associations(associations)
+    calibration = resolve(config, _CALIBRATION, "")
+    return FolderSource(folder.resolve().name, pairs, calibration, config, _groundtruth_file(folder))
+
+
+def _groundtruth_file(folder: Path) -> Path | None:
+    if (folder / "groundtruth.txt").exists():
+        return folder / "groundtruth.txt"
+    found = sorted(folder.glob("*.gt.freiburg"))
+    return found[0] if len(found) == 1 else None
