@@ -41,9 +41,7 @@ def _left_jacobian(omega: Array) -> Array:
     W = hat(omega)
     if angle < 1e-5:
         return np.eye(3) + 0.5 * W + W @ W / 6.0
-    return (
-        np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * W + (angle - np.sin(angle)) / angle**3 * W @ W
-    )
+    return np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * W + (angle - np.sin(angle)) / angle**3 * W @ W
 
 
 def se3_exp(xi: ArrayLike) -> Array:

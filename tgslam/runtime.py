@@ -34,9 +34,13 @@ def start(device: Device = Device.AUTO, threads: int = 0) -> Device:
     wanted = Device.CPU if device is Device.AUTO else device
     if _Runtime.device is not None:
         if _Runtime.device is not wanted:
-            raise DeviceError(f"the kernels already run on {_Runtime.device.value}; start a new process to use {wanted.value}")
+            raise DeviceError(
+                f"the kernels already run on {_Runtime.device.value}; start a new process to use {wanted.value}"
+            )
         return wanted
-    threads = threads or len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1))
+    threads = threads or len(
+        os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
+    )
     ti.init(
         arch=ti.cuda if wanted is Device.CUDA else ti.cpu,
         default_ip=ti.i32,

@@ -1,0 +1,254 @@
+"""Projection of 3D Gaussians to screen-space splats, and its gradient.
+
+A splat is what the rasterizer needs of a Gaussian: centre, inverse covariance, opacity, tangent-plane depth, colour.
+Columns of a splat row (and of its gradient) are the constants below.
+"""
+
+import taichi as ti
+
+from tgslam.kernels.simd import ALPHA_MIN, TILE
+
+nd = ti.types.ndarray
+mat3 = ti.types.matrix(3, 3, ti.f32)
+mat23 = ti.types.matrix(2, 3, ti.f32)
+
+U, V, QA, QB, QC, OPACITY, Z, ZU, ZV, RED, EMBEDDING = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 12
+SPLAT = 15  # columns of a splat row: u, v, qa, qb, qc, opacity, z, zu, zv, r, g, b, e0, e1, e2
+CURVATURE_COLOUR, CURVATURE_DEPTH = 15, 16
+SPLAT_GRAD = 17  # a gradient row has two more: the summed weights of the colour and the depth residuals
+
+BLUR = 0.3  # px^2 added to the screen covariance, the 3DGS standard's low-pass filter
+NEAR_M = 0.05
+EDGE = 1.3  # the Jacobian is evaluated at most this many half-images off the axis
+POSE_BLOCK = 512  # Gaussians whose pose gradients one writer sums
+
+
+@ti.func
+def sigmoid(x):
+    """Logistic function, stable for both signs."""
+    e = ti.exp(-ti.abs(x))
+    return ti.select(x >= 0, 1.0 / (1.0 + e), e / (1.0 + e))
+
+
+@ti.func
+def rotation_from_quat(w, x, y, z):
+    """Unit quaternion -> rotation matrix."""
+    return mat3(
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    )
+
+
+@ti.func
+def rotation_of_pose(pose: ti.template()):
+    """The rotation of T_cw, stored row by row as [R | t]."""
+    return mat3([pose[0], pose[1], pose[2]], [pose[4], pose[5], pose[6]], [pose[8], pose[9], pose[10]])
+
+
+@ti.func
+def clamped(ratio, centre, focal, size):
+    """x/z (or y/z) limited to EDGE half-images around the image, so that the linearisation stays sane beside the camera."""
+    low = (-0.5 * (EDGE - 1.0) * size - centre) / focal
+    high = ((1.0 + 0.5 * (EDGE - 1.0)) * size - centre) / focal
+    return ti.min(ti.max(ratio, low), high)
+
+
+@ti.kernel
+def project(
+    count: ti.i32,
+    mean: nd(ti.f32, ndim=2),  # [N, 3] m, world
+    log_scale: nd(ti.f32, ndim=2),  # [N, 3] log m
+    quat: nd(ti.f32, ndim=2),  # [N, 4] wxyz
+    opacity_logit: nd(ti.f32, ndim=1),  # [N]
+    colour: nd(ti.f32, ndim=2),  # [N, 3]
+    embedding: nd(ti.f32, ndim=2),  # [N, 3] theta
+    pose: nd(ti.f32, ndim=1),  # [12] T_cw
+    camera: nd(ti.f32, ndim=1),  # [4] fx, fy, cx, cy px
+    width: ti.i32,
+    height: ti.i32,
+    splat: nd(ti.f32, ndim=2),  # [N, SPLAT] out
+    tile_rect: nd(ti.i32, ndim=2),  # [N, 4] out: first and last tile in x, then in y; empty: first > last
+    tile_count: nd(ti.i32, ndim=1),  # [N] out: tiles touched
+):
+    """Gaussians -> splats and the tiles that their alpha >= 1/255 box touches (Zwicker's EWA, as 3DGS)."""
+    for i in range(count):
+        R = rotation_of_pose(pose)
+        x = R @ ti.Vector([mean[i, 0], mean[i, 1], mean[i, 2]]) + ti.Vector([pose[3], pose[7], pose[11]])
+        tile_rect[i, 0], tile_rect[i, 1], tile_rect[i, 2], tile_rect[i, 3] = 0, -1, 0, -1
+        tile_count[i] = 0
+        if x[2] > NEAR_M:
+            fx, fy = camera[0], camera[1]
+            q = ti.Vector([quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3]]).normalized()
+            L = rotation_from_quat(q[0], q[1], q[2], q[3])
+            for k in ti.static(range(3)):
+                s = ti.exp(log_scale[i, k])
+                for r in ti.static(range(3)):
+                    L[r, k] *= s
+            M = R @ L
+            inv_z = 1.0 / x[2]
+            jx = -clamped(x[0] * inv_z, camera[2], fx, width) * fx * inv_z
+            jy = -clamped(x[1] * inv_z, camera[3], fy, height) * fy * inv_z
+            ax = ti.Vector([fx * inv_z * M[0, k] + jx * M[2, k] for k in range(3)])
+            ay = ti.Vector([fy * inv_z * M[1, k] + jy * M[2, k] for k in range(3)])
+            mz = ti.Vector([M[2, 0], M[2, 1], M[2, 2]])
+            cxx, cxy, cyy = ax.dot(ax) + BLUR, ax.dot(ay), ay.dot(ay) + BLUR
+            inv_det = 1.0 / ti.max(cxx * cyy - cxy * cxy, 1e-12)
+            qxx, qxy, qyy = cyy * inv_det, -cxy * inv_det, cxx * inv_det
+            szu, szv = mz.dot(ax), mz.dot(ay)
+            u, v = fx * x[0] * inv_z + camera[2], fy * x[1] * inv_z + camera[3]
+            opacity = sigmoid(opacity_logit[i])
+            splat[i, U], splat[i, V] = u, v
+            splat[i, QA], splat[i, QB], splat[i, QC] = 0.5 * qxx, qxy, 0.5 * qyy
+            splat[i, OPACITY], splat[i, Z] = opacity, x[2]
+            splat[i, ZU], splat[i, ZV] = szu * qxx + szv * qxy, szu * qxy + szv * qyy
+            for c in ti.static(range(3)):
+                splat[i, RED + c] = colour[i, c]
+                splat[i, EMBEDDING + c] = sigmoid(embedding[i, c])
+            reach = 2.0 * ti.log(ti.max(opacity / ALPHA_MIN, 1.0))  # Mahalanobis^2 where alpha has fallen to ALPHA_MIN
+            rx, ry = ti.sqrt(reach * cxx), ti.sqrt(reach * cyy)
+            if reach > 0.0 and u + rx >= 0 and u - rx <= width - 1 and v + ry >= 0 and v - ry <= height - 1:
+                x0 = ti.cast(ti.max(u - rx, 0.0), ti.i32) // TILE
+                x1 = ti.cast(ti.min(u + rx, width - 1.0), ti.i32) // TILE
+                y0 = ti.cast(ti.max(v - ry, 0.0), ti.i32) // TILE
+                y1 = ti.cast(ti.min(v + ry, height - 1.0), ti.i32) // TILE
+                tile_rect[i, 0], tile_rect[i, 1] = x0, x1
+                tile_rect[i, 2], tile_rect[i, 3] = y0, y1
+                tile_count[i] = (x1 - x0 + 1) * (y1 - y0 + 1)
+
+
+@ti.kernel
+def project_backward(
+    count: ti.i32,
+    mean: nd(ti.f32, ndim=2),  # [N, 3] m, world
+    log_scale: nd(ti.f32, ndim=2),  # [N, 3] log m
+    quat: nd(ti.f32, ndim=2),  # [N, 4] wxyz
+    opacity_logit: nd(ti.f32, ndim=1),  # [N]
+    embedding: nd(ti.f32, ndim=2),  # [N, 3] theta
+    pose: nd(ti.f32, ndim=1),  # [12] T_cw
+    camera: nd(ti.f32, ndim=1),  # [4] fx, fy, cx, cy px
+    width: ti.i32,
+    height: ti.i32,
+    tile_count: nd(ti.i32, ndim=1),  # [N] 0 = not rendered
+    splat_grad: nd(ti.f32, ndim=2),  # [N, SPLAT_GRAD]
+    grad_mean: nd(ti.f32, ndim=2),  # [N, 3] added to, as are all outputs but the pose's
+    grad_log_scale: nd(ti.f32, ndim=2),  # [N, 3]
+    grad_quat: nd(ti.f32, ndim=2),  # [N, 4]
+    grad_opacity_logit: nd(ti.f32, ndim=1),  # [N]
+    grad_colour: nd(ti.f32, ndim=2),  # [N, 3]
+    grad_embedding: nd(ti.f32, ndim=2),  # [N, 3]
+    curvature: nd(ti.f32, ndim=2),  # [N, 2] summed residual weights: colour, depth
+    grad_pose: nd(ti.f32, ndim=2),  # [blocks, 6] (rotation, translation), left perturbation of T_cw, a row a block
+):
+    """Gradients of splat rows -> gradients of the Gaussians' parameters and of the pose."""
+    for block in range(grad_pose.shape[0]):
+        pose_sum = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        for i in range(block * POSE_BLOCK, ti.min((block + 1) * POSE_BLOCK, count)):
+            if tile_count[i] > 0:
+                # The forward quantities again
+                R = rotation_of_pose(pose)
+                x = R @ ti.Vector([mean[i, 0], mean[i, 1], mean[i, 2]]) + ti.Vector([pose[3], pose[7], pose[11]])
+                fx, fy = camera[0], camera[1]
+                raw = ti.Vector([quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3]])
+                inv_norm = 1.0 / raw.norm()
+                q = raw * inv_norm
+                Rq = rotation_from_quat(q[0], q[1], q[2], q[3])
+                s = ti.Vector([ti.exp(log_scale[i, k]) for k in range(3)])
+                M = R @ Rq
+                for k in ti.static(range(3)):
+                    for r in ti.static(range(3)):
+                        M[r, k] *= s[k]
+                inv_z = 1.0 / x[2]
+                rx, ry = x[0] * inv_z, x[1] * inv_z
+                tx, ty = clamped(rx, camera[2], fx, width), clamped(ry, camera[3], fy, height)
+                j0, j1, jx, jy = fx * inv_z, fy * inv_z, -tx * fx * inv_z, -ty * fy * inv_z
+                mz = ti.Vector([M[2, 0], M[2, 1], M[2, 2]])
+                ax = ti.Vector([j0 * M[0, k] + jx * M[2, k] for k in range(3)])
+                ay = ti.Vector([j1 * M[1, k] + jy * M[2, k] for k in range(3)])
+                cxx, cxy, cyy = ax.dot(ax) + BLUR, ax.dot(ay), ay.dot(ay) + BLUR
+                inv_det = 1.0 / ti.max(cxx * cyy - cxy * cxy, 1e-12)
+                qxx, qxy, qyy = cyy * inv_det, -cxy * inv_det, cxx * inv_det
+                szu, szv = mz.dot(ax), mz.dot(ay)
+                # Inverse covariance and depth slopes -> covariance and its products with the z row
+                gu, gv, gz = splat_grad[i, U], splat_grad[i, V], splat_grad[i, Z]
+                gzu, gzv = splat_grad[i, ZU], splat_grad[i, ZV]
+                gxx = 0.5 * splat_grad[i, QA] + gzu * szu
+                gyy = 0.5 * splat_grad[i, QC] + gzv * szv
+                gxy = 0.5 * (splat_grad[i, QB] + gzu * szv + gzv * szu)  # the symmetric matrix's off-diagonal
+                pxx, pxy = qxx * gxx + qxy * gxy, qxx * gxy + qxy * gyy
+                pyx, pyy = qxy * gxx + qyy * gxy, qxy * gxy + qyy * gyy
+                hxx, hyy = -(pxx * qxx + pxy * qxy), -(pyx * qxy + pyy * qyy)
+                hxy = -(pxx * qxy + pxy * qyy)
+                gsu, gsv = qxx * gzu + qxy * gzv, qxy * gzu + qyy * gzv
+                gax = 2.0 * (hxx * ax + hxy * ay) + gsu * mz
+                gay = 2.0 * (hxy * ax + hyy * ay) + gsv * mz
+                gmz = gsu * ax + gsv * ay
+                # Rows of A = J M -> J and M
+                m0 = ti.Vector([M[0, 0], M[0, 1], M[0, 2]])
+                m1 = ti.Vector([M[1, 0], M[1, 1], M[1, 2]])
+                gj0, gj1, gjx, gjy = gax.dot(m0), gay.dot(m1), gax.dot(mz), gay.dot(mz)
+                gm0, gm1, gm2 = j0 * gax, j1 * gay, jx * gax + jy * gay + gmz
+                # Camera-frame centre
+                inv_z2 = inv_z * inv_z
+                gx, gy = gu * j0, gv * j1
+                gzc = gz - (gu * fx * rx + gv * fy * ry) * inv_z - (gj0 * fx + gj1 * fy) * inv_z2
+                if tx == rx:
+                    gx -= gjx * fx * inv_z2
+                    gzc += 2.0 * gjx * fx * tx * inv_z2
+                else:
+                    gzc += gjx * fx * tx * inv_z2
+                if ty == ry:
+                    gy -= gjy * fy * inv_z2
+                    gzc += 2.0 * gjy * fy * ty * inv_z2
+                else:
+                    gzc += gjy * fy * ty * inv_z2
+                gp = ti.Vector([gx, gy, gzc])
+                gw = R.transpose() @ gp
+                for c in ti.static(range(3)):
+                    grad_mean[i, c] += gw[c]
+                # Left perturbation: dx = w cross x + t, dM = [w] M
+                turn = x.cross(gp)
+                for k in ti.static(range(3)):
+                    turn += ti.Vector([M[0, k], M[1, k], M[2, k]]).cross(ti.Vector([gm0[k], gm1[k], gm2[k]]))
+                for c in ti.static(range(3)):
+                    pose_sum[c] += turn[c]
+                    pose_sum[3 + c] += gp[c]
+                # M = R Rq S
+                H = R.transpose() @ ti.Matrix.rows([gm0, gm1, gm2])
+                for k in ti.static(range(3)):
+                    dot = 0.0
+                    for r in ti.static(range(3)):
+                        dot += H[r, k] * Rq[r, k]
+                        H[r, k] *= s[k]
+                    grad_log_scale[i, k] += dot * s[k]
+                w, a, b, c = q[0], q[1], q[2], q[3]
+                gq = 2.0 * ti.Vector(
+                    [
+                        a * (H[2, 1] - H[1, 2]) + b * (H[0, 2] - H[2, 0]) + c * (H[1, 0] - H[0, 1]),
+                        w * (H[2, 1] - H[1, 2])
+                        + b * (H[0, 1] + H[1, 0])
+                        + c * (H[0, 2] + H[2, 0])
+                        - 2.0 * a * (H[1, 1] + H[2, 2]),
+                        w * (H[0, 2] - H[2, 0])
+                        + a * (H[0, 1] + H[1, 0])
+                        + c * (H[1, 2] + H[2, 1])
+                        - 2.0 * b * (H[0, 0] + H[2, 2]),
+                        w * (H[1, 0] - H[0, 1])
+                        + a * (H[0, 2] + H[2, 0])
+                        + b * (H[1, 2] + H[2, 1])
+                        - 2.0 * c * (H[0, 0] + H[1, 1]),
+                    ]
+                )
+                gq = (gq - q * gq.dot(q)) * inv_norm
+                for k in ti.static(range(4)):
+                    grad_quat[i, k] += gq[k]
+                opacity = sigmoid(opacity_logit[i])
+                grad_opacity_logit[i] += splat_grad[i, OPACITY] * opacity * (1.0 - opacity)
+                for k in ti.static(range(3)):
+                    grad_colour[i, k] += splat_grad[i, RED + k]
+                    e = sigmoid(embedding[i, k])
+                    grad_embedding[i, k] += splat_grad[i, EMBEDDING + k] * e * (1.0 - e)
+                curvature[i, 0] += splat_grad[i, CURVATURE_COLOUR]
+                curvature[i, 1] += splat_grad[i, CURVATURE_DEPTH]
+        for c in ti.static(range(6)):
+            grad_pose[block, c] = pose_sum[c]
