@@ -1,0 +1,1 @@
+"""Metrics: trajectory errors against ground truth, and rendered images against measured ones."""
