@@ -167,6 +167,13 @@ def test_default_calibration_is_not_scaled_to_another_size(tmp_path: Path) -> No
         opened(path.write(), DatasetConfig(format="tum"))
 
 
+def test_principal_point_outside_the_image_is_warned_of(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    opened(folder)
+    assert not caplog.text
+    opened(folder, replace(TUM, cx=319.5))
+    assert "outside its 64x48 images" in caplog.text
+
+
 def test_unknown_camera_names_the_keys_to_set(folder: Path) -> None:
     with pytest.raises(ConfigError, match=r"dataset\.cx.*freiburg1"):
         opened(folder, replace(TUM, cx=0.0))

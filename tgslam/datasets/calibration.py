@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from tgslam.config.schema import DatasetConfig
 from tgslam.errors import ConfigError
 from tgslam.types import Camera
 
+_log = logging.getLogger(__name__)
 _DISTORTION_LENGTHS = (4, 5, 8, 12, 14)  # OpenCV's models
 
 
@@ -66,11 +68,24 @@ def resolve(config: DatasetConfig, default: Calibration | None, hint: str) -> Ca
 
 
 def check_size(calibration: Calibration, width: int, height: int, name: str) -> None:
-    """Raise ConfigError if the calibration was published for images of another size: it is never scaled silently."""
+    """Raise ConfigError if the calibration was published for images of another size: it is never scaled silently.
+
+    A principal point outside the image, the usual sign of configured values for another size, is logged as a warning.
+    """
     if calibration.size not in (None, (width, height)):
         raise ConfigError(
             f"{name}: its images are {width}x{height}, but the default camera is for "
             f"{'x'.join(map(str, calibration.size or ()))}; set dataset.fx, dataset.fy, dataset.cx, dataset.cy (px)"
+        )
+    if not (0 <= calibration.cx < width and 0 <= calibration.cy < height):
+        _log.warning(
+            "%s: the principal point (%g, %g) px lies outside its %dx%d images; are dataset.cx and dataset.cy for "
+            "another size?",
+            name,
+            calibration.cx,
+            calibration.cy,
+            width,
+            height,
         )
 
 
