@@ -1,0 +1,38 @@
+"""What needs the kernels, imported at first use: `--help` and errors in arguments do not wait for it."""
+
+from __future__ import annotations
+
+import argparse
+
+from tgslam.config.schema import Config
+from tgslam.evaluation.protocol import Render
+from tgslam.pipeline import System
+from tgslam.types import Camera
+
+
+def add_device_option(parser: argparse.ArgumentParser) -> None:
+    """`--device`, the same for every command that runs kernels."""
+    parser.add_argument(
+        "--device", choices=("auto", "cpu", "cuda"), default="auto", help="where the kernels run (default: auto)"
+    )
+
+
+def start_device(name: str) -> str:
+    """Start the kernels on device `name` and return the one in use. Raises DeviceError."""
+    from tgslam.runtime import Device, start
+
+    return start(Device(name)).value
+
+
+def make_system(camera: Camera, config: Config) -> System:
+    """The SLAM system for frames of `camera`."""
+    from tgslam.slam import Slam
+
+    return Slam(camera, config)
+
+
+def make_render(camera: Camera) -> Render:
+    """The function that renders a map for `camera`."""
+    from tgslam.render import Rasterizer
+
+    return Rasterizer(camera).render

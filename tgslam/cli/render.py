@@ -1,0 +1,113 @@
+"""`tgslam render`: a run's map seen along a trajectory, from its keyframes, or on a swing round what it saw first."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tgslam.cli import engine
+from tgslam.errors import OutputError
+from tgslam.geometry import inverse, se3_exp, transform_points
+from tgslam.output.images import write_colour, write_depth, write_depth_colours
+from tgslam.output.ply import read_map
+from tgslam.output.run_folder import RunFolder
+from tgslam.output.trajectory_io import read_trajectory, write_trajectory
+from tgslam.types import Gaussians, Matrix4, Trajectory
+
+_log = logging.getLogger(__name__)
+_ORBIT_YAW_RAD = np.deg2rad(20.0)
+_ORBIT_PITCH_RAD = np.deg2rad(8.0)
+_ORBIT_FPS = 30.0
+_FAR_PERCENTILE = 95.0  # of the distances to the map's Gaussians: the blue end of depth colours
+
+
+def add_parser(commands: Any) -> argparse.ArgumentParser:
+    """Add the command to the subparsers `commands`."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "render",
+        help="render images of a run's map",
+        description="Write colour/, depth/ (16-bit PNG, 5000 units a metre, 0 = none) and depth_colours/, "
+        "one PNG a pose, and the poses themselves in poses.txt.",
+    )
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--trajectory", type=Path, metavar="FILE", help="camera-to-world poses as TUM text")
+    what.add_argument("--keyframes", action="store_true", help="the run's keyframes")
+    what.add_argument("--orbit", action="store_true", help="a closed swing round what the first keyframe looks at")
+    parser.add_argument("--count", type=_positive, default=60, metavar="N", help="poses of --orbit (default: 60)")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="folder (default: RUN/render-...)")
+    parser.add_argument("--overwrite", action="store_true", help="write into a folder that is not empty")
+    engine.add_device_option(parser)
+    return parser
+
+
+def execute(args: argparse.Namespace) -> int:
+    """Render every pose."""
+    folder = RunFolder.open(args.run)
+    camera = folder.read_record().camera
+    gaussians = read_map(folder.map)
+    name, poses = _poses(args, folder, gaussians)
+    output = args.output or folder.path / f"render-{name}"
+    if output.exists() and (not output.is_dir() or any(output.iterdir())) and not args.overwrite:
+        raise OutputError(f"{output}: is there already; choose another --output, or add --overwrite")
+    engine.start_device(args.device)
+    render = engine.make_render(camera)
+    for kind in ("colour", "depth", "depth_colours"):
+        (output / kind).mkdir(parents=True, exist_ok=True)
+    far_m = _far_m(gaussians, poses.T_wc[0])
+    for number, T_wc in enumerate(poses.T_wc):
+        image = render(gaussians, inverse(T_wc))
+        file_name = f"{number:06d}.png"
+        write_colour(output / "colour" / file_name, image.colour)
+        write_depth(output / "depth" / file_name, image.depth_m)
+        write_depth_colours(output / "depth_colours" / file_name, image.depth_m, far_m)
+    write_trajectory(output / "poses.txt", poses)
+    _log.info("%d images of each kind are in %s", len(poses), output)
+    return 0
+
+
+def orbit(gaussians: Gaussians, T_wc: Matrix4, count: int) -> Trajectory:
+    """Poses on a closed curve round the point straight ahead of `T_wc`, at the median depth of the Gaussians before it.
+
+    The camera keeps looking at that point. Raises OutputError when no Gaussian is in front of the camera.
+    """
+    depths_m = transform_points(inverse(T_wc), gaussians.mean)[:, 2]
+    if not (depths_m > 0).any():
+        raise OutputError("no Gaussian lies in front of the first keyframe, so there is nothing to orbit")
+    to_pivot = np.eye(4)
+    to_pivot[2, 3] = np.median(depths_m[depths_m > 0])
+    phases = 2.0 * np.pi * np.arange(count) / count
+    turns = [
+        se3_exp([_ORBIT_PITCH_RAD * (np.cos(phase) - 1.0), _ORBIT_YAW_RAD * np.sin(phase), 0, 0, 0, 0])
+        for phase in phases
+    ]
+    poses = [T_wc @ to_pivot @ turn @ inverse(to_pivot) for turn in turns]
+    return Trajectory(np.arange(count) / _ORBIT_FPS, np.stack(poses))
+
+
+def _poses(args: argparse.Namespace, folder: RunFolder, gaussians: Gaussians) -> tuple[str, Trajectory]:
+    """A name for the folder, and at least one pose."""
+    if args.trajectory is not None:
+        name, path = args.trajectory.stem, args.trajectory
+    else:
+        name, path = "orbit" if args.orbit else "keyframes", folder.keyframes
+    poses = read_trajectory(path)
+    if not len(poses):
+        raise OutputError(f"{path}: holds no pose")
+    return name, orbit(gaussians, poses.T_wc[0], args.count) if args.orbit else poses
+
+
+def _far_m(gaussians: Gaussians, T_wc: Matrix4) -> float:
+    if not len(gaussians):
+        return 1.0
+    return float(np.percentile(np.linalg.norm(gaussians.mean - T_wc[:3, 3], axis=1), _FAR_PERCENTILE)) or 1.0
+
+
+def _positive(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 1 or more")
+    return int(text)

@@ -1,0 +1,143 @@
+"""`tgslam run`: frames in; a run folder with trajectory, map and metrics out."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import logging
+import time
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from tgslam import __version__, pipeline
+from tgslam.cli import engine
+from tgslam.cli.inputs import Frames, open_frames, resolve_config
+from tgslam.cli.interrupt import StopRequest
+from tgslam.cli.summary import print_metrics
+from tgslam.config.schema import Config
+from tgslam.datasets.source import RgbdSource, parse_frame_slice
+from tgslam.errors import TgslamError
+from tgslam.evaluation.run_metrics import complete, evaluate_run, peak_rss_mb
+from tgslam.output.console import error_console
+from tgslam.output.progress import frame_progress
+from tgslam.output.run_folder import RunFolder, RunRecord, RunState, fresh_folder
+from tgslam.types import Trajectory
+
+_log = logging.getLogger(__name__)
+_EXIT_INTERRUPTED = 130
+
+
+def add_parser(commands: Any) -> argparse.ArgumentParser:
+    """Add the command to the subparsers `commands`."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "run",
+        help="reconstruct a sequence (without arguments: the built-in room)",
+        description="Track the camera through an RGB-D sequence and build its Gaussian map. "
+        "Ctrl-C ends the run after the current frame and saves everything so far.",
+    )
+    parser.add_argument("config", nargs="?", type=Path, metavar="CONFIG", help="YAML file, or a packaged one by name")
+    parser.add_argument("--input", type=Path, metavar="DIR", help="folder of the sequence")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="run folder (default: a new one under runs/)")
+    parser.add_argument("--frames", metavar="START:STOP:STEP", help="which frames, as a Python slice (100: or ::2)")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override a setting; repeatable"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace the run that --output holds")
+    parser.add_argument("--no-final", action="store_true", help="leave out the final refinement of the map")
+    engine.add_device_option(parser)
+    return parser
+
+
+def execute(args: argparse.Namespace) -> int:
+    """Do the run and evaluate it; 130 when it was stopped early."""
+    started_s = time.perf_counter()
+    config = resolve_config(args.config, args.input, args.set)
+    frames = _frames(args.frames)
+    device = engine.start_device(args.device)
+    source = open_frames(config, args.input, frames)
+    path = args.output or fresh_folder(Path("runs"), source.name, datetime.now())
+    folder = RunFolder.create(path, args.overwrite)
+    record = RunRecord(
+        tgslam=__version__,
+        state=RunState.RUNNING,
+        source=source.name,
+        input=None if args.input is None else str(args.input.resolve()),
+        frames=frames,
+        camera=source.camera,
+    )
+    folder.write_record(record)
+    folder.write_config(config)
+    try:
+        with StopRequest() as stop:
+            metrics = _run_and_evaluate(args, config, source, folder, stop)
+    except BaseException as error:
+        _mark_failed(folder, record, error)
+        raise
+    metrics |= {"device": device, "seed": config.seed}
+    metrics |= {"wall_s": time.perf_counter() - started_s, "peak_rss_mb": peak_rss_mb()}
+    folder.write_metrics(complete(metrics))
+    folder.write_record(dataclasses.replace(record, state=RunState(metrics["state"])))
+    print_metrics(f"{source.name} -> {folder.path}", complete(metrics))
+    if metrics["state"] == RunState.INTERRUPTED.value:
+        _log.warning("stopped after %d of %d frames; all of them are saved", metrics["frames"], len(source))
+        return _EXIT_INTERRUPTED
+    return 0
+
+
+def _run_and_evaluate(
+    args: argparse.Namespace, config: Config, source: RgbdSource, folder: RunFolder, stop: StopRequest
+) -> dict[str, Any]:
+    """The metrics of the run, from the files that it wrote; images are left out once the user asked to stop."""
+    system = engine.make_system(source.camera, config)
+    with frame_progress(len(source), error_console(), args.quiet) as observer:
+        summary = pipeline.run(
+            source,
+            system,
+            folder,
+            read_ahead=config.dataset.format != "synthetic",  # built-in scenes are drawn by kernels of this thread
+            refine=not args.no_final,
+            observer=observer,
+            stop_requested=stop,
+        )
+    start_s = time.perf_counter()
+    metrics = evaluate_run(
+        folder,
+        config.evaluation,
+        source,
+        _groundtruth(source),
+        make_render=None if stop() else lambda: engine.make_render(source.camera),
+        stop_requested=stop,
+    )
+    metrics["stage_s"] |= {
+        "read": summary.read_s,
+        "finish": summary.finish_s,
+        "evaluate": time.perf_counter() - start_s,
+    }
+    metrics["fps"] = len(summary.reports) / summary.loop_s if summary.reports else None
+    metrics["state"] = (RunState.INTERRUPTED if stop() else RunState.FINISHED).value
+    return metrics
+
+
+def _groundtruth(source: RgbdSource) -> Trajectory | None:
+    """The ground truth, opened only now that tracking is over; the run stands without it."""
+    try:
+        return source.groundtruth()
+    except TgslamError as error:
+        _log.warning("the trajectory metrics are null: %s", error)
+        return None
+
+
+def _frames(text: str | None) -> Frames:
+    if text is None:
+        return (None, None, None)
+    frames = parse_frame_slice(text)
+    return (frames.start, frames.stop, frames.step)
+
+
+def _mark_failed(folder: RunFolder, record: RunRecord, error: BaseException) -> None:
+    """Say in run.json that the run failed, if that can still be written."""
+    try:
+        folder.write_record(dataclasses.replace(record, state=RunState.FAILED, message=f"{error}"))
+    except OSError as second:
+        _log.warning("%s could not be updated: %s", folder.record, second)

@@ -1,0 +1,37 @@
+"""The metrics of a run as a table."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tgslam.output.console import print_table
+
+_LINES = (  # label, key, format
+    ("frames", "frames", "{:d}"),
+    ("skipped", "frames_skipped", "{:d}"),
+    ("lost", "frames_lost", "{:d}"),
+    ("tracked", "tracked_fraction", "{:.1%}"),
+    ("keyframes", "keyframes", "{:d}"),
+    ("Gaussians", "gaussians", "{:,d}"),
+    ("ATE, keyframes", "ate_rmse_cm", "{:.2f} cm"),
+    ("ATE, all frames", "ate_rmse_all_cm", "{:.2f} cm"),
+    ("RPE, translation", "rpe_trans_cm", "{:.3f} cm"),
+    ("RPE, rotation", "rpe_rot_deg", "{:.3f} deg"),
+    ("held-out frames", "heldout_frames", "{:d}"),
+    ("PSNR", "psnr_db", "{:.2f} dB"),
+    ("PSNR, with depth", "psnr_masked_db", "{:.2f} dB"),
+    ("SSIM", "ssim", "{:.4f}"),
+    ("depth L1", "depth_l1_cm", "{:.2f} cm"),
+    ("speed", "fps", "{:.2f} frames/s"),
+    ("wall time", "wall_s", "{:.1f} s"),
+    ("peak memory", "peak_rss_mb", "{:.0f} MiB"),
+)
+
+
+def print_metrics(title: str, metrics: dict[str, Any]) -> None:
+    """Print what applies; a metric that is null shows as `-`."""
+    print_table(title, [(label, _text(metrics.get(key), form)) for label, key, form in _LINES])
+
+
+def _text(value: Any, form: str) -> str:
+    return "-" if value is None else form.format(value)

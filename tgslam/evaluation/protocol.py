@@ -1,0 +1,103 @@
+"""The fixed protocol of every figure that tgslam reports: which frames are compared with what.
+
+Trajectory: SE(3)-aligned ATE over keyframes and over all frames, RPE over all frames. Images: every
+`holdout_interval`-th frame that is no keyframe, rendered at its estimated pose and full resolution, without any
+exposure compensation.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+
+from tgslam.config.schema import EvaluationConfig
+from tgslam.datasets.source import RgbdSource
+from tgslam.errors import EvaluationError, FrameError
+from tgslam.evaluation.images import ImageScores, mean_scores, score_rendering
+from tgslam.evaluation.trajectory import ate, rpe
+from tgslam.geometry import inverse
+from tgslam.types import FrameReport, FrameStatus, Gaussians, Matrix4, Rendering, Trajectory
+
+_log = logging.getLogger(__name__)
+
+Metrics = dict[str, float | None]
+Render = Callable[[Gaussians, Matrix4], Rendering]  # the map seen from T_cw
+
+TRAJECTORY_KEYS = ("ate_rmse_cm", "ate_rmse_all_cm", "rpe_trans_cm", "rpe_rot_deg")
+IMAGE_KEYS = ("psnr_db", "ssim", "lpips", "psnr_masked_db", "depth_l1_cm", "heldout_frames")
+
+
+def is_held_out(frame_index: int, interval: int) -> bool:
+    """Whether `Frame.index` is one that mapping must not see: the last of every `interval` frames."""
+    return frame_index % interval == interval - 1
+
+
+def trajectory_metrics(
+    every_frame: Trajectory, keyframes: Trajectory, groundtruth: Trajectory, config: EvaluationConfig
+) -> Metrics:
+    """The values of `TRAJECTORY_KEYS`; null, with a logged reason, for what too few poses leave open."""
+    tolerance_s = config.association_tolerance_s
+
+    def or_none(compute: Callable[[], Metrics]) -> Metrics:
+        try:
+            return compute()
+        except EvaluationError as error:
+            _log.warning("a trajectory metric is null: %s", error)
+            return {}
+
+    def relative() -> Metrics:
+        result = rpe(every_frame, groundtruth, tolerance_s, config.rpe_delta_frames)
+        return {"rpe_trans_cm": 100.0 * result.trans_rmse_m, "rpe_rot_deg": result.rot_rmse_deg}
+
+    return {
+        **dict.fromkeys(TRAJECTORY_KEYS),
+        **or_none(lambda: {"ate_rmse_cm": 100.0 * ate(keyframes, groundtruth, tolerance_s).rmse_m}),
+        **or_none(lambda: {"ate_rmse_all_cm": 100.0 * ate(every_frame, groundtruth, tolerance_s).rmse_m}),
+        **or_none(relative),
+    }
+
+
+def held_out_poses(reports: Sequence[FrameReport], every_frame: Trajectory, interval: int) -> list[tuple[int, Matrix4]]:
+    """(position in the source, T_wc) of the held-out frames of a run.
+
+    reports: one a frame of the source, in order. every_frame: one pose for each of them that was not skipped.
+    Raises EvaluationError when the two do not belong together.
+    """
+    posed = [(position, report) for position, report in enumerate(reports) if report.status is not FrameStatus.SKIPPED]
+    if len(posed) != len(every_frame):
+        raise EvaluationError(
+            f"the log lists {len(posed)} frames with a pose, but the trajectory has {len(every_frame)} poses; "
+            "they are not of one run"
+        )
+    return [
+        (position, T_wc)
+        for (position, report), T_wc in zip(posed, every_frame.T_wc, strict=True)
+        if is_held_out(report.index, interval) and not report.is_keyframe
+    ]
+
+
+def image_metrics(
+    source: RgbdSource,
+    poses: Sequence[tuple[int, Matrix4]],
+    gaussians: Gaussians,
+    render: Render,
+    stop_requested: Callable[[], bool] = lambda: False,
+) -> Metrics:
+    """The values of `IMAGE_KEYS` over the frames of `held_out_poses`; null when there is none or on a request to stop.
+
+    A frame that cannot be read is left out.
+    """
+    scores: list[ImageScores] = []
+    for position, T_wc in poses:
+        if stop_requested():
+            return dict.fromkeys(IMAGE_KEYS)
+        try:
+            frame = source.read(position)
+        except FrameError as error:
+            _log.warning("a held-out frame is left out: %s", error)
+            continue
+        scores.append(score_rendering(render(gaussians, inverse(T_wc)), frame))
+    if not scores:
+        _log.warning("no frame was held out: the image metrics are null")
+        return dict.fromkeys(IMAGE_KEYS)
+    return {**dict.fromkeys(IMAGE_KEYS), **vars(mean_scores(scores)), "heldout_frames": len(scores)}

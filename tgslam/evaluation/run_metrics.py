@@ -1,0 +1,94 @@
+"""metrics.json: what a run counted while it ran, and what comparing its files with the input says."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from tgslam.config.schema import EvaluationConfig
+from tgslam.datasets.source import RgbdSource
+from tgslam.errors import OutputError
+from tgslam.evaluation.protocol import (
+    IMAGE_KEYS,
+    TRAJECTORY_KEYS,
+    Render,
+    held_out_poses,
+    image_metrics,
+    trajectory_metrics,
+)
+from tgslam.output.log import read_log
+from tgslam.output.ply import read_map
+from tgslam.output.run_folder import RunFolder
+from tgslam.output.trajectory_io import read_trajectory
+from tgslam.types import FrameReport, FrameStatus, Trajectory
+
+METRIC_KEYS = (
+    *("state", "frames", "frames_skipped", "frames_lost", "tracked_fraction"),
+    *("keyframes", "gaussians", "planes", "closures"),
+    *("wall_s", "fps", "peak_rss_mb", "device", "seed"),
+    *TRAJECTORY_KEYS,
+    *IMAGE_KEYS,
+    "stage_s",
+)
+
+
+def complete(metrics: dict[str, Any]) -> dict[str, Any]:
+    """`metrics` with every key of metrics.json in its fixed order, null where there is no value."""
+    return {key: metrics.get(key) for key in METRIC_KEYS}
+
+
+def counts(reports: Sequence[FrameReport]) -> dict[str, Any]:
+    """What a run's frame reports add up to: frames by fate, keyframes, Gaussians, seconds by stage."""
+    fates = Counter(report.status for report in reports)
+    stage_s: Counter[str] = Counter()
+    for report in reports:
+        stage_s.update(report.stage_s)
+    used = fates[FrameStatus.INITIAL] + fates[FrameStatus.TRACKED]
+    return {
+        "frames": len(reports),
+        "frames_skipped": fates[FrameStatus.SKIPPED],
+        "frames_lost": fates[FrameStatus.LOST],
+        "tracked_fraction": used / len(reports) if reports else None,
+        "keyframes": sum(report.is_keyframe for report in reports),
+        "gaussians": reports[-1].gaussians if reports else 0,
+        "stage_s": dict(stage_s),
+    }
+
+
+def evaluate_run(
+    folder: RunFolder,
+    config: EvaluationConfig,
+    source: RgbdSource | None,
+    groundtruth: Trajectory | None,
+    make_render: Callable[[], Render] | None,
+    stop_requested: Callable[[], bool] = lambda: False,
+) -> dict[str, Any]:
+    """Every metric that the files of a run and its input give: the one way for both `run` and `eval`.
+
+    make_render: makes the function that renders the map; None leaves the image metrics null, as no source does.
+    Raises OutputError when the run was cut off before it wrote its trajectory, or a file of it is damaged.
+    """
+    if not folder.trajectory.exists():
+        raise OutputError(f"{folder.path}: this run did not come to its end: it has no {folder.trajectory.name}")
+    reports = read_log(folder.log)
+    every_frame, keyframes = read_trajectory(folder.trajectory), read_trajectory(folder.keyframes)
+    gaussians = read_map(folder.map)
+    metrics: dict[str, Any] = {**counts(reports), "keyframes": len(keyframes), "gaussians": len(gaussians)}
+    if groundtruth is not None:
+        metrics |= trajectory_metrics(every_frame, keyframes, groundtruth, config)
+    if source is not None and make_render is not None:
+        poses = held_out_poses(reports, every_frame, config.holdout_interval)
+        metrics |= image_metrics(source, poses, gaussians, make_render(), stop_requested)
+    return metrics
+
+
+def peak_rss_mb() -> float | None:
+    """The most memory in MiB that this process has held so far; None where the system does not say."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024.0 * 1024.0 if sys.platform == "darwin" else 1024.0)

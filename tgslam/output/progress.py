@@ -1,0 +1,96 @@
+"""How far a run is: a bar in a terminal, a log line now and then elsewhere, nothing when asked to be quiet."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from tgslam.types import FrameReport
+
+_log = logging.getLogger(__name__)
+_LINE_INTERVAL_S = 10.0
+_LINE_FRACTION = 0.1
+
+
+class FrameObserver(Protocol):
+    """Told about every frame as soon as it is done."""
+
+    def __call__(self, report: FrameReport) -> None:
+        """Take note of one frame."""
+
+
+class _Counts:
+    """Frames, keyframes and Gaussians so far, and the frames per second."""
+
+    def __init__(self, total: int) -> None:
+        self.total, self.frames, self.keyframes, self.gaussians = total, 0, 0, 0
+        self._start_s = time.monotonic()
+
+    def add(self, report: FrameReport) -> None:
+        self.frames += 1
+        self.keyframes += report.is_keyframe
+        self.gaussians = max(report.gaussians, 0) or self.gaussians
+
+    @property
+    def fps(self) -> float:
+        return self.frames / max(time.monotonic() - self._start_s, 1e-9)
+
+    def __str__(self) -> str:
+        return f"{self.fps:.1f} frames/s, {self.keyframes} keyframes, {self.gaussians:,} Gaussians"
+
+
+@contextmanager
+def frame_progress(total: int, console: Console, quiet: bool) -> Iterator[FrameObserver]:
+    """An observer of the `total` frames to come, for as long as the block lasts."""
+    if quiet:
+        yield lambda report: None
+    elif console.is_terminal:
+        with _bar(console) as bar:
+            yield _BarObserver(bar, total)
+    else:
+        yield _LineObserver(total)
+
+
+def _bar(console: Console) -> Progress:
+    return Progress(
+        TextColumn("frames"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[counts]}"),
+        console=console,
+    )
+
+
+class _BarObserver:
+    def __init__(self, bar: Progress, total: int) -> None:
+        self._bar, self._counts = bar, _Counts(total)
+        self._task = bar.add_task("frames", total=total, counts="")
+
+    def __call__(self, report: FrameReport) -> None:
+        self._counts.add(report)
+        self._bar.update(self._task, advance=1, counts=str(self._counts))
+
+
+class _LineObserver:
+    """A line after every tenth of the frames or ten seconds, whichever comes later; and one at the end."""
+
+    def __init__(self, total: int) -> None:
+        self._counts = _Counts(total)
+        self._next_frames = _LINE_FRACTION * total
+        self._next_s = time.monotonic() + _LINE_INTERVAL_S
+
+    def __call__(self, report: FrameReport) -> None:
+        counts = self._counts
+        counts.add(report)
+        due = counts.frames >= self._next_frames and time.monotonic() >= self._next_s
+        if due or counts.frames == counts.total:
+            _log.info("frame %d of %d: %s", counts.frames, counts.total, counts)
+            self._next_frames = counts.frames + _LINE_FRACTION * counts.total
+            self._next_s = time.monotonic() + _LINE_INTERVAL_S

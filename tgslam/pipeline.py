@@ -1,0 +1,182 @@
+"""One run: reads frames, hands them to the system, writes what comes out. It knows no algorithm and no ground truth."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+from tgslam.datasets.source import RgbdSource
+from tgslam.errors import FrameError, TrackingError
+from tgslam.output.log import FrameLog
+from tgslam.output.ply import write_map
+from tgslam.output.progress import FrameObserver
+from tgslam.output.run_folder import RunFolder
+from tgslam.output.trajectory_io import write_trajectory
+from tgslam.types import Frame, FrameReport, FrameStatus, Gaussians, Trajectory
+
+_log = logging.getLogger(__name__)
+_MAX_WARNINGS = 5  # skipped or lost frames that are named; log.jsonl has all
+
+
+class System(Protocol):
+    """What a run needs of the SLAM system."""
+
+    def process_frame(self, frame: Frame) -> FrameReport:
+        """Take the next frame of the sequence."""
+
+    def finish(self) -> None:
+        """Refine the map once all frames are in."""
+
+    def trajectory(self) -> Trajectory:
+        """Camera-to-world poses of every frame that was not skipped."""
+
+    def keyframe_trajectory(self) -> Trajectory:
+        """Camera-to-world poses of the keyframes."""
+
+    def gaussians(self) -> Gaussians:
+        """The map."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """How a run went."""
+
+    reports: list[FrameReport]  # one a frame
+    loop_s: float  # wall time of the frame loop
+    finish_s: float  # wall time of the final refinement
+    read_s: float  # of the loop: time spent waiting for frames
+    interrupted: bool  # stopped on request before the last frame
+
+
+def run(
+    source: RgbdSource,
+    system: System,
+    folder: RunFolder,
+    *,
+    read_ahead: bool = True,
+    refine: bool = True,
+    observer: FrameObserver = lambda report: None,
+    stop_requested: Callable[[], bool] = lambda: False,
+) -> Summary:
+    """Feed every frame to `system`, refine, and write trajectory.txt, keyframes.txt and map.ply; log.jsonl grows on.
+
+    read_ahead: decode the next frame in a thread meanwhile; only for a source that does not use the kernels itself.
+    refine: call `finish`; never done after a request to stop.
+    stop_requested: asked before each frame; when true, the run ends there and writes what it has.
+    Raises TrackingError when no frame at all could be tracked. When anything is raised, no result file exists, but the
+    poses and the map up to there are kept as partial_trajectory.txt and partial_map.ply where that is possible.
+    """
+    try:
+        summary = _frame_loop(source, system, folder, read_ahead, observer, stop_requested)
+        _check_tracked(source.name, summary.reports)
+        if refine and not summary.interrupted:
+            start_s = time.perf_counter()
+            system.finish()
+            summary = replace(summary, finish_s=time.perf_counter() - start_s)
+    except Exception:
+        _save_partial(system, folder)
+        raise
+    write_trajectory(folder.trajectory, system.trajectory())
+    write_trajectory(folder.keyframes, system.keyframe_trajectory())
+    write_map(folder.map, system.gaussians())
+    return summary
+
+
+def read_frames(source: RgbdSource, ahead: bool) -> Iterator[Frame | FrameError]:
+    """Every frame in order, or why it cannot be used; with `ahead`, one thread reads the next one meanwhile."""
+    if not ahead:
+        for position in range(len(source)):
+            yield _read(source, position)
+        return
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="read-ahead") as pool:
+        upcoming = pool.submit(_read, source, 0)
+        for position in range(1, len(source) + 1):
+            current = upcoming.result()
+            if position < len(source):
+                upcoming = pool.submit(_read, source, position)
+            yield current
+
+
+def _read(source: RgbdSource, position: int) -> Frame | FrameError:
+    try:
+        return source.read(position)
+    except FrameError as error:
+        return error
+
+
+def _frame_loop(
+    source: RgbdSource,
+    system: System,
+    folder: RunFolder,
+    read_ahead: bool,
+    observer: FrameObserver,
+    stop_requested: Callable[[], bool],
+) -> Summary:
+    reports: list[FrameReport] = []
+    read_s, interrupted = 0.0, False
+    start_s = waiting_since_s = time.perf_counter()
+    with FrameLog(folder.log) as log:
+        for position, item in enumerate(read_frames(source, read_ahead)):
+            read_s += time.perf_counter() - waiting_since_s
+            if stop_requested():
+                interrupted = True
+                break
+            gaussians = reports[-1].gaussians if reports else 0
+            report = _skipped(position, item, gaussians) if isinstance(item, FrameError) else system.process_frame(item)
+            reports.append(report)
+            log.append(report)
+            observer(report)
+            _warn(reports)
+            waiting_since_s = time.perf_counter()
+    loop_s = time.perf_counter() - start_s
+    return Summary(reports, loop_s=loop_s, finish_s=0.0, read_s=read_s, interrupted=interrupted)
+
+
+def _skipped(position: int, error: FrameError, gaussians: int) -> FrameReport:
+    """The report of a frame that never reached the system; its time is not known, its index is its position."""
+    return FrameReport(
+        index=position,
+        timestamp_s=math.nan,
+        status=FrameStatus.SKIPPED,
+        is_keyframe=False,
+        gaussians=gaussians,
+        stage_s={},
+        measures={},
+        message=str(error),
+    )
+
+
+def _warn(reports: list[FrameReport]) -> None:
+    """Say why the last frame was skipped or lost, for the first few of a run."""
+    report = reports[-1]
+    if report.status not in (FrameStatus.SKIPPED, FrameStatus.LOST):
+        return
+    count = sum(earlier.status is report.status for earlier in reports)
+    if count <= _MAX_WARNINGS:
+        _log.warning("frame %d is %s: %s", report.index, report.status.value, report.message or "no reason given")
+    if count == _MAX_WARNINGS:
+        _log.warning("further %s frames are named in log.jsonl only", report.status.value)
+
+
+def _check_tracked(name: str, reports: list[FrameReport]) -> None:
+    used = sum(report.status in (FrameStatus.INITIAL, FrameStatus.TRACKED) for report in reports)
+    tracked = sum(report.status is FrameStatus.TRACKED for report in reports)
+    if reports and (used == 0 or (tracked == 0 and len(reports) > 1)):
+        last = next((report.message for report in reversed(reports) if report.message), "no reason given")
+        raise TrackingError(
+            f"{name}: none of {len(reports)} frames could be tracked; the last one: {last}; "
+            "check dataset.depth_scale and the camera's fx, fy, cx, cy"
+        )
+
+
+def _save_partial(system: System, folder: RunFolder) -> None:
+    """Keep what there is of a run that failed; the failure itself is what the user hears about."""
+    with contextlib.suppress(Exception):  # whatever went wrong may have left the system in any state
+        write_trajectory(folder.partial_trajectory, system.trajectory())
+        write_map(folder.partial_map, system.gaussians())
