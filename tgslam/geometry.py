@@ -81,23 +81,35 @@ def orthonormalized(T: ArrayLike) -> Array:
 
 
 def quat_wxyz_from_matrix(R: ArrayLike) -> Array:
-    """Rotation matrix [3, 3] -> unit quaternion wxyz [4] with w >= 0 (Shepperd: divides by the largest component)."""
+    """Rotation matrix [3, 3] -> unit quaternion wxyz [4] with w >= 0."""
+    return quat_wxyz_from_matrices(np.asarray(R, np.float64)[None])[0]
+
+
+def quat_wxyz_from_matrices(R: ArrayLike) -> Array:
+    """Rotation matrices [N, 3, 3] -> unit quaternions wxyz [N, 4] with w >= 0 (Shepperd: by the largest component)."""
     R = np.asarray(R, np.float64)
-    trace = np.trace(R)
-    squares = np.array([trace, R[0, 0], R[1, 1], R[2, 2]])
-    largest = int(np.argmax(squares))
-    if largest == 0:
-        quat = np.array([1.0 + trace, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    else:
-        i = largest - 1
-        j, k = (i + 1) % 3, (i + 2) % 3
-        quat = np.empty(4)
-        quat[0] = R[k, j] - R[j, k]
-        quat[1 + i] = 1.0 + R[i, i] - R[j, j] - R[k, k]
-        quat[1 + j] = R[i, j] + R[j, i]
-        quat[1 + k] = R[i, k] + R[k, i]
-    quat /= np.linalg.norm(quat)
-    return quat if quat[0] >= 0 else -quat
+    m = {(i, j): R[:, i, j] for i in range(3) for j in range(3)}
+    candidates = np.stack(
+        [
+            [1 + m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+            [m[2, 1] - m[1, 2], 1 + m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
+            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 1 - m[0, 0] + m[1, 1] - m[2, 2], m[1, 2] + m[2, 1]],
+            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1 - m[0, 0] - m[1, 1] + m[2, 2]],
+        ]
+    )  # [4 candidates, 4 components, N]: each is the quaternion times four times one of its components
+    best = np.argmax(np.einsum("iin->in", candidates), axis=0)
+    quat = candidates[best, :, np.arange(len(R))]
+    quat /= np.linalg.norm(quat, axis=-1, keepdims=True)
+    return np.where(quat[:, :1] < 0, -quat, quat)
+
+
+def adjoint(T: ArrayLike) -> Array:
+    """[6, 6] with exp(adjoint(T) xi) = T exp(xi) T^-1, for twists (rotation, translation)."""
+    T = np.asarray(T, np.float64)
+    result = np.zeros((6, 6))
+    result[:3, :3] = result[3:, 3:] = T[:3, :3]
+    result[3:, :3] = hat(T[:3, 3]) @ T[:3, :3]
+    return result
 
 
 def matrix_from_quat_wxyz(quat_wxyz: ArrayLike) -> Array:

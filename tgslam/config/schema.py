@@ -49,12 +49,86 @@ class LossConfig:
     """The adaptive RGB-depth objective, Eqs. 10-13."""
 
     gate_percentile: float = setting(95.0, 50.0, 100.0)  # G_max of Eq. 11 is this percentile of the gradient magnitude
+    gate_noise_floor: float = setting(0.01, 1e-6, 1.0)  # epsilon of Eq. 11, intensity per px: weaker gradients are noise
+    gate_depth_boost: float = setting(1.0, 0.0, 100.0)  # depth residuals are weighted by 1 + this * T
+    min_depth_opacity: float = setting(0.5, 0.01, 1.0)  # rendered depth counts above this opacity
     charbonnier_colour: float = setting(0.02, 1e-6, 1.0)  # epsilon, intensity in [0, 1]
+    charbonnier_grad: float = setting(0.01, 1e-6, 1.0)  # epsilon, intensity per px
     charbonnier_depth_sigmas: float = setting(1.0, 1e-3, 100.0)  # epsilon, in standard deviations of the depth noise
     depth_sigma_per_m2: float = setting(0.0015, 1e-6, 1.0)  # sensor noise: sigma_z = this * z^2, 1/m
     weight_l1: float = setting(1.0, 0.0, 100.0)
     weight_grad: float = setting(0.5, 0.0, 100.0)
     weight_ssim: float = setting(0.2, 0.0, 100.0)
+    weight_pho: float = setting(1.0, 0.0, 100.0)  # lambda_pho of Eq. 14
+    weight_geo: float = setting(0.02, 0.0, 100.0)  # lambda_geo: one sigma of depth weighs like one epsilon of intensity
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """Pose of each frame against the map."""
+
+    solver: str = setting("gauss_newton", choices=("gauss_newton", "first_order"))
+    levels: int = setting(3, 1, 6)  # image pyramid below the input resolution; the finest level used is 1/2
+    iterations: tuple[int, ...] = setting((8, 6, 4))  # Gauss-Newton steps by level, coarse to fine
+    renders: int = setting(1, 1, 5)  # the map is rendered this often at the latest estimate
+    sigma_colour: float = setting(0.05, 1e-4, 1.0)  # intensity residual of weight 1
+    sigma_gradient: float = setting(0.02, 1e-4, 1.0)  # gradient residual of weight 1, 1/px
+    weight_depth: float = setting(1.0, 0.0, 100.0)
+    weight_colour: float = setting(0.1, 0.0, 100.0)
+    weight_gradient: float = setting(0.1, 0.0, 100.0)
+    max_distance_sigmas: float = setting(15.0, 1.0, 1000.0)  # depth residuals beyond are no match
+    exposure_prior: float = setting(1000.0, 0.0, 1e9)  # how strongly gain 1 and bias 0 are believed, in pixels
+    min_opacity: float = setting(0.8, 0.0, 1.0)  # model pixels less covered are not used
+    first_order_iterations: int = setting(40, 1, 1000)
+    first_order_rate: float = setting(0.001, 1e-6, 1.0)  # Adam step, rad and m
+    lost_inlier_ratio: float = setting(0.3, 0.0, 1.0)  # fewer matched pixels with a residual below 3 sigma: lost
+    lost_overlap: float = setting(0.1, 0.0, 1.0)  # fewer live pixels that meet the map: lost
+    lost_condition: float = setting(1e7, 1.0, 1e15)  # worse conditioned normal equations: lost
+
+
+@dataclass(frozen=True)
+class KeyframeConfig:
+    """When a frame becomes a keyframe (section 3.1, co-visibility)."""
+
+    min_overlap: float = setting(0.85, 0.0, 1.0)  # Gaussians seen by frame and last keyframe, intersection over union
+    max_unexplained: float = setting(0.08, 0.0, 1.0)  # share of pixels with depth that the map does not cover
+    max_interval: int = setting(30, 1, 100_000)  # frames
+
+
+@dataclass(frozen=True)
+class SeedingConfig:
+    """Gaussians from RGB-D."""
+
+    largest_cell_px: int = setting(8, 1, 64)  # power of two times smallest_cell_px
+    smallest_cell_px: int = setting(2, 1, 64)
+    plain_colour_std: float = setting(0.015, 0.0, 1.0)  # a cell whose channels vary less has no texture
+    planar_sigmas: float = setting(2.0, 0.0, 100.0)  # a cell whose plane residual is less, in sensor sigmas, is flat
+    overlap: float = setting(0.6, 0.1, 3.0)  # standard deviation of a Gaussian in cell sizes
+    thickness: float = setting(0.1, 1e-3, 1.0)  # standard deviation along the normal, relative to across
+    opacity: float = setting(0.7, 0.01, 0.99)
+
+
+@dataclass(frozen=True)
+class MappingConfig:
+    """Insertion, pruning and refinement of the map."""
+
+    optimizer: str = setting("relaxation", choices=("relaxation", "adam"))  # how colours move; geometry moves by Adam
+    window: int = setting(8, 1, 1000)  # keyframes refined together
+    window_random: int = setting(2, 0, 1000)  # of them, drawn from all earlier keyframes
+    iterations: int = setting(12, 0, 10_000)  # views rendered and refined a keyframe
+    final_iterations: int = setting(60, 0, 1_000_000)  # after the last frame, over all keyframes; 0 = off
+    refine_poses: bool = setting(True)
+    insert_opacity: float = setting(0.6, 0.0, 1.0)  # the map does not explain a pixel that it covers less than this
+    insert_sigmas: float = setting(8.0, 0.0, 1000.0)  # nor one whose surface stands this far in front of the map's
+    prune_opacity: float = setting(0.05, 0.0, 1.0)
+    prune_weight_px: float = setting(0.05, 0.0, 1000.0)  # blend weight summed over the window's pixels
+    rate_mean_px: float = setting(0.02, 0.0, 10.0)  # Adam steps: pixels of the median depth
+    rate_scale: float = setting(0.005, 0.0, 1.0)  # in log scale
+    rate_rotation: float = setting(0.002, 0.0, 1.0)
+    rate_opacity: float = setting(0.03, 0.0, 10.0)  # in logit
+    rate_colour: float = setting(0.01, 0.0, 1.0)  # only with optimizer: adam
+    rate_pose: float = setting(0.0003, 0.0, 1.0)  # rad and m
+    relaxation: float = setting(0.7, 0.0, 1.9)  # 1 = the full step
 
 
 @dataclass(frozen=True)
@@ -73,5 +147,9 @@ class Config:
     seed: int = setting(0, 0, 2**31 - 1)
     dataset: DatasetConfig = dataclasses.field(default_factory=DatasetConfig)
     synthetic: SyntheticConfig = dataclasses.field(default_factory=SyntheticConfig)
+    tracking: TrackingConfig = dataclasses.field(default_factory=TrackingConfig)
+    keyframes: KeyframeConfig = dataclasses.field(default_factory=KeyframeConfig)
+    seeding: SeedingConfig = dataclasses.field(default_factory=SeedingConfig)
+    mapping: MappingConfig = dataclasses.field(default_factory=MappingConfig)
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)

@@ -1,0 +1,1 @@
+"""Mapping: seeding Gaussians from RGB-D keyframes, pruning, and refining the map with the window's poses."""
