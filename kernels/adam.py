@@ -1,0 +1,82 @@
+"""Adam kernels: one fused pass over parameter, gradient and both moments, rows in parallel."""
+
+import taichi as ti
+
+F1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
+F2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
+I1 = ti.types.ndarray(dtype=ti.i32, ndim=1)
+
+
+@ti.kernel
+def count_steps(
+    rows: ti.i32,  # rows in use, at most the length of each array
+    visible: I1,  # [N] 0 = leave the row alone
+    steps: I1,  # [N] updates that each row has had, in and out
+):
+    """Count one more update for every visible row."""
+    for i in range(rows):
+        steps[i] = steps[i] + ti.select(visible[i] != 0, 1, 0)
+
+
+@ti.func
+def update(g, m_old, v_old, beta1, beta2, epsilon, correct_m, correct_v):
+    """New moments and the change of the parameter for a learning rate of 1."""
+    m = beta1 * m_old + (1.0 - beta1) * g
+    v = beta2 * v_old + (1.0 - beta2) * g * g
+    return m, v, -m * correct_m / (ti.sqrt(v * correct_v) + epsilon)
+
+
+@ti.kernel
+def adam_rows(
+    rows: ti.i32,
+    rate: ti.f32,
+    beta1: ti.f32,
+    beta2: ti.f32,
+    epsilon: ti.f32,
+    correction: F2,  # [T, 2] 1 / (1 - beta^t) of both moments after t updates; the last row holds for every later t
+    steps: I1,  # [N] updates including this one
+    visible: I1,  # [N]
+    gradient: F2,  # [N, C]
+    parameter: F2,  # [N, C] in and out
+    m: F2,  # [N, C] first moment, in and out
+    v: F2,  # [N, C] second moment, in and out
+):
+    """Adam with a bias correction of its own for each row; rows that are not visible keep value and moments."""
+    for i in range(rows):
+        if visible[i] != 0:
+            t = ti.min(steps[i], correction.shape[0] - 1)
+            correct_m, correct_v = correction[t, 0], correction[t, 1]
+            for c in range(parameter.shape[1]):
+                m_new, v_new, change = update(
+                    gradient[i, c], m[i, c], v[i, c], beta1, beta2, epsilon, correct_m, correct_v
+                )
+                m[i, c] = m_new
+                v[i, c] = v_new
+                parameter[i, c] = parameter[i, c] + rate * change
+
+
+@ti.kernel
+def adam_scalars(
+    rows: ti.i32,
+    rate: ti.f32,
+    beta1: ti.f32,
+    beta2: ti.f32,
+    epsilon: ti.f32,
+    correction: F2,  # [T, 2]
+    steps: I1,  # [N]
+    visible: I1,  # [N]
+    gradient: F1,  # [N]
+    parameter: F1,  # [N] in and out
+    m: F1,  # [N] in and out
+    v: F1,  # [N] in and out
+):
+    """`adam_rows` for a parameter with one value a row."""
+    for i in range(rows):
+        if visible[i] != 0:
+            t = ti.min(steps[i], correction.shape[0] - 1)
+            m_new, v_new, change = update(
+                gradient[i], m[i], v[i], beta1, beta2, epsilon, correction[t, 0], correction[t, 1]
+            )
+            m[i] = m_new
+            v[i] = v_new
+            parameter[i] = parameter[i] + rate * change

@@ -1,0 +1,140 @@
+"""Adam over named parameter arrays whose rows come and go with the map."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tgslam import runtime
+from tgslam.arrays import require
+from tgslam.kernels import adam as kernels
+
+_MAX_CORRECTIONS = 1 << 15
+_MIN_CAPACITY = 64
+
+
+class Adam:
+    """Adam with a learning rate per group; all groups have the same rows.
+
+    Only visible rows change. Each row has its own count of updates for the bias correction, so a row that is seen
+    seldom, or was added late, takes the same first steps as any other. Moments live on the device with spare capacity
+    that doubles when rows are appended.
+    """
+
+    def __init__(
+        self,
+        channels: dict[str, int],
+        learning_rates: dict[str, float],
+        rows: int = 0,
+        betas: tuple[float, float] = (0.9, 0.999),
+        epsilon: float = 1e-15,
+    ) -> None:
+        """channels: values per row of each group, 0 for a one-dimensional array [N].
+
+        learning_rates: per group, in the parameter's unit; may be changed between steps. betas, epsilon: as usual in
+        Adam. Raises ValueError if the two dicts name different groups.
+        """
+        if channels.keys() != learning_rates.keys():
+            raise ValueError(f"groups {sorted(channels)} need learning rates, but got {sorted(learning_rates)}")
+        self.learning_rates = dict(learning_rates)
+        self._channels = dict(channels)
+        self._betas, self._epsilon = betas, epsilon
+        self._rows = rows
+        self._correction = runtime.to_device(_corrections(*betas))
+        self._allocate(max(rows, _MIN_CAPACITY))
+
+    @property
+    def rows(self) -> int:
+        """Rows in use."""
+        return self._rows
+
+    def moments(self, group: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Host views or copies of the first and second moment of a group, [rows] or [rows, C]."""
+        return runtime.to_host(self._m[group])[: self._rows], runtime.to_host(self._v[group])[: self._rows]
+
+    def step_counts(self) -> NDArray[np.int32]:
+        """Updates that each row has had, [rows]."""
+        return runtime.to_host(self._steps)[: self._rows]
+
+    def step(
+        self, parameters: dict[str, np.ndarray], gradients: dict[str, np.ndarray], visible: np.ndarray | None = None
+    ) -> None:
+        """Update float32 [N] or [N, C] parameters in place from gradients of that shape; N may exceed `rows`.
+
+        visible: int32 [N], 0 = leave the row and its moments alone; by default every row is updated. Groups that are
+        not in `parameters` rest. Raises ValueError for unknown groups, other shapes or dtypes.
+        """
+        for group in parameters:
+            if group not in self._channels:
+                raise ValueError(f"unknown group {group!r}: the optimiser has {sorted(self._channels)}")
+            shape = self._shape(group, self._rows)
+            require(f"parameter {group!r}", parameters[group], shape, at_least=True)
+            require(f"gradient {group!r}", gradients[group], shape, at_least=True)
+        if visible is None:
+            visible = self._all_visible
+        require("visible", visible, (self._rows,), np.int32, at_least=True)
+        kernels.count_steps(self._rows, visible, self._steps)
+        for group, parameter in parameters.items():
+            update = kernels.adam_rows if self._channels[group] else kernels.adam_scalars
+            update(
+                self._rows, self.learning_rates[group], *self._betas, self._epsilon, self._correction, self._steps,
+                visible, gradients[group], parameter, self._m[group], self._v[group],
+            )  # fmt: skip
+
+    def append(self, rows: int) -> None:
+        """Add rows with no history at the end."""
+        start, self._rows = self._rows, self._rows + rows
+        capacity = self._steps.shape[0]
+        if self._rows > capacity:
+            self._reallocate(np.arange(start), max(self._rows, 2 * capacity))
+
+    def keep(self, kept: NDArray[np.bool_] | NDArray[np.integer]) -> None:
+        """Keep these rows, as a mask [rows] or as indices in the new order, with their moments and step counts.
+
+        Raises ValueError if a mask has another length, IndexError if an index is out of range.
+        """
+        if kept.dtype == np.bool_:
+            rows = np.flatnonzero(require("kept", kept, (self._rows,), np.bool_))
+        else:
+            rows = kept.astype(np.int64)
+            if len(rows) and not (rows.min() >= 0 and rows.max() < self._rows):
+                raise IndexError(f"rows to keep must be in 0..{self._rows - 1}")
+        self._rows = len(rows)
+        self._reallocate(rows, self._steps.shape[0])
+
+    def _shape(self, group: str, rows: int) -> tuple[int, ...]:
+        channels = self._channels[group]
+        return (rows, channels) if channels else (rows,)
+
+    def _allocate(self, capacity: int) -> None:
+        self._m = {group: runtime.zeros(self._shape(group, capacity)) for group in self._channels}
+        self._v = {group: runtime.zeros(self._shape(group, capacity)) for group in self._channels}
+        self._steps = runtime.zeros((capacity,), np.int32)
+        self._all_visible = runtime.empty((capacity,), np.int32)
+        self._all_visible.fill(1)
+
+    def _reallocate(self, kept: NDArray[np.integer], capacity: int) -> None:
+        """New arrays that start with the rows `kept` of the old ones, the rest zero."""
+        old_m, old_v, old_steps = self._m, self._v, self._steps
+        self._allocate(capacity)
+        for group in self._channels:
+            self._m[group] = _moved(old_m[group], kept, self._m[group])
+            self._v[group] = _moved(old_v[group], kept, self._v[group])
+        self._steps = _moved(old_steps, kept, self._steps)
+
+
+def _moved(old: np.ndarray, kept: NDArray[np.integer], new: np.ndarray) -> np.ndarray:
+    host = runtime.to_host(new)
+    host[: len(kept)] = runtime.to_host(old)[kept]
+    return runtime.to_device(host, host.dtype.type)
+
+
+def _corrections(beta1: float, beta2: float) -> NDArray[np.float32]:
+    """Bias corrections 1 / (1 - beta^t), [T, 2], up to the t from which they are 1 in float32."""
+    slowest = max(beta1, beta2)
+    length = 2 if slowest <= 0.0 else min(_MAX_CORRECTIONS, math.ceil(math.log(1e-8) / math.log(slowest)) + 2)
+    t = np.arange(length, dtype=np.float64)
+    t[0] = 1.0  # no row is updated before its first count
+    return np.stack([1.0 / (1.0 - beta1**t), 1.0 / (1.0 - beta2**t)], axis=1).astype(np.float32)
