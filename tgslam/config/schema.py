@@ -68,8 +68,9 @@ class TrackingConfig:
     """Pose of each frame against the map."""
 
     solver: str = setting("gauss_newton", choices=("gauss_newton", "first_order"))
-    levels: int = setting(3, 1, 6)  # image pyramid below the input resolution; the finest level used is 1/2
-    iterations: tuple[int, ...] = setting((8, 6, 4))  # Gauss-Newton steps by level, coarse to fine
+    finest_width_px: int = setting(400, 16, 4096)  # images are halved until they are at most this wide
+    levels: int = setting(3, 1, 6)  # of the image pyramid, each half the size of the one before
+    iterations: tuple[int, ...] = setting((4, 6, 8))  # Gauss-Newton steps at most, by level, fine to coarse
     renders: int = setting(1, 1, 5)  # the map is rendered this often at the latest estimate
     sigma_colour: float = setting(0.05, 1e-4, 1.0)  # intensity residual of weight 1
     sigma_gradient: float = setting(0.02, 1e-4, 1.0)  # gradient residual of weight 1, 1/px

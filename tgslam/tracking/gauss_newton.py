@@ -1,0 +1,136 @@
+"""Gauss-Newton tracking: render the map once near the pose, align the frame to that image coarse to fine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tgslam import images, runtime
+from tgslam.config.schema import LossConfig, TrackingConfig
+from tgslam.gaussian_map import GaussianMap
+from tgslam.geometry import adjoint, inverse, se3_exp
+from tgslam.kernels import alignment
+from tgslam.render import Rasterizer
+from tgslam.tracking.lost import evidence_against
+from tgslam.tracking.pyramid import LiveLevel, ModelLevel, finest_level, live_pyramid, model_pyramid
+from tgslam.tracking.result import Exposure, TrackingResult
+from tgslam.types import Camera, Frame
+
+_CONVERGED = 1e-5  # rad and m: a smaller step ends a level
+_UPPER = np.triu_indices(alignment.UNKNOWNS)
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """J^T W J, J^T W r and the statistics of one evaluation."""
+
+    A: NDArray[np.float64]  # [8, 8]
+    b: NDArray[np.float64]  # [8]
+    live_pixels: float
+    candidates: float  # live pixels that meet a model pixel
+    matched: float  # of them, with depths that agree roughly
+    inliers: float  # of them, within three sigma
+    depth_residual: float  # mean, in sigmas
+    colour_residual: float  # mean, in intensity
+
+
+class GaussNewtonTracker:
+    """Minimises the RGB-depth objective over the pose and the frame's gain and bias."""
+
+    def __init__(self, camera: Camera, config: TrackingConfig, loss: LossConfig) -> None:
+        self.config, self.loss = config, loss
+        self.first = finest_level(camera, config.finest_width_px)
+        self.camera = camera
+        self.rasterizer = Rasterizer(camera.halved(self.first))
+
+    def track(self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure) -> TrackingResult:
+        """Pose of `frame` from the prediction T_cw [4, 4] and the last frame's exposure."""
+        live = live_pyramid(frame, self.camera, self.first, self.config.levels, self.loss.gate_percentile)
+        for _ in range(self.config.renders):
+            model = self._model(gaussians, T_cw)
+            T_ml, exposure, last = self._align(live, model, exposure)
+            T_cw = inverse(T_ml) @ T_cw
+        information = adjoint(T_ml).T @ last.A[:6, :6] @ adjoint(T_ml)
+        measures = {
+            "inlier_ratio": last.inliers / max(last.matched, 1.0),
+            "overlap": last.matched / max(last.live_pixels, 1.0),
+            "depth_residual_sigmas": last.depth_residual,
+            "colour_residual": last.colour_residual,
+            "condition": float(np.linalg.cond(information)),
+        }
+        message = evidence_against(measures, self.config)
+        return TrackingResult(T_cw, exposure, information, bool(message), message, measures)
+
+    def _model(self, gaussians: GaussianMap, T_cw: NDArray[np.float64]) -> list[ModelLevel]:
+        rendered = self.rasterizer.forward(gaussians, T_cw)
+        opacity = runtime.to_host(rendered.opacity)
+        covered = opacity > self.config.min_opacity
+        safe = np.maximum(opacity, self.config.min_opacity)
+        depth = np.where(covered, runtime.to_host(rendered.depth) / safe, np.float32(0.0))
+        grey = runtime.to_host(images.luminance(rendered.colour)) / safe
+        return model_pyramid(
+            runtime.to_device(grey), runtime.to_device(depth), self.rasterizer.camera, self.config.levels,
+            self.loss.depth_sigma_per_m2,
+        )  # fmt: skip
+
+    def _align(
+        self, live: list[LiveLevel], model: list[ModelLevel], exposure: Exposure
+    ) -> tuple[NDArray[np.float64], Exposure, NormalEquations]:
+        """Coarse to fine from the identity; returns T_ml, the exposure, and the last equations."""
+        T_ml = np.eye(4)
+        for level in reversed(range(len(live))):
+            for _ in range(self.config.iterations[level]):
+                equations = self._linearise(live[level], model[level], T_ml, exposure)
+                step = self._solve(equations, exposure)
+                T_ml = se3_exp(step[:6]) @ T_ml
+                exposure = Exposure(exposure.gain + step[6], exposure.bias + step[7])
+                if np.abs(step[:6]).max() < _CONVERGED:
+                    break
+        return T_ml, exposure, equations
+
+    def _solve(self, equations: NormalEquations, exposure: Exposure) -> NDArray[np.float64]:
+        """The step [8]; gain and bias are held near (1, 0) by a prior, directions without evidence by a weak damping."""
+        A, b = equations.A.copy(), equations.b.copy()
+        A[6, 6] += self.config.exposure_prior
+        A[7, 7] += self.config.exposure_prior
+        b[6] += self.config.exposure_prior * (exposure.gain - 1.0)
+        b[7] += self.config.exposure_prior * exposure.bias
+        A[np.diag_indices(6)] += 1e-6 * np.trace(A[:6, :6]) + 1e-9
+        return np.linalg.solve(A, -b)
+
+    def _linearise(self, live: LiveLevel, model: ModelLevel, T_ml: NDArray[np.float64], exposure: Exposure) -> NormalEquations:
+        config, camera = self.config, live.camera
+        settings = np.zeros(alignment.SETTINGS, np.float32)
+        settings[[alignment.FX, alignment.FY, alignment.CX, alignment.CY]] = camera.fx, camera.fy, camera.cx, camera.cy
+        settings[alignment.GAIN], settings[alignment.BIAS] = exposure.gain, exposure.bias
+        settings[alignment.DEPTH_SIGMA] = self.loss.depth_sigma_per_m2
+        settings[alignment.MAX_DISTANCE_SIGMAS] = config.max_distance_sigmas
+        settings[alignment.CHARBONNIER_DEPTH] = self.loss.charbonnier_depth_sigmas
+        settings[alignment.SIGMA_COLOUR], settings[alignment.SIGMA_GRADIENT] = config.sigma_colour, config.sigma_gradient
+        settings[alignment.WEIGHT_DEPTH] = config.weight_depth
+        settings[alignment.WEIGHT_COLOUR] = config.weight_colour
+        settings[alignment.WEIGHT_GRADIENT] = config.weight_gradient
+        partial = runtime.empty((camera.height, alignment.PARTIAL))
+        alignment.normal_equations(
+            runtime.to_device(settings), runtime.to_device(T_ml[:3].reshape(12)), 1,
+            live.depth, live.grey, live.grad_x, live.grad_y, live.gate,
+            model.depth, model.normal, model.grey, model.grad_x, model.grad_y, model.grad_xx, model.grad_xy, model.grad_yy,
+            partial,
+        )  # fmt: skip
+        sums = runtime.to_host(partial).sum(0, dtype=np.float64)
+        A = np.zeros((alignment.UNKNOWNS, alignment.UNKNOWNS))
+        A[_UPPER] = sums[: alignment.TRIANGLE]
+        A = A + np.triu(A, 1).T
+        matched = sums[alignment.MATCHED]
+        return NormalEquations(
+            A=A,
+            b=sums[alignment.RHS : alignment.RHS + alignment.UNKNOWNS],
+            live_pixels=float((runtime.to_host(live.depth) > 0).sum()),
+            candidates=sums[alignment.CANDIDATES],
+            matched=matched,
+            inliers=sums[alignment.INLIERS],
+            depth_residual=sums[alignment.DEPTH_SUM] / max(matched, 1.0),
+            colour_residual=sums[alignment.COLOUR_SUM] / max(sums[alignment.COLOUR_COUNT], 1.0) * config.sigma_colour,
+        )

@@ -1,0 +1,33 @@
+"""Constant-velocity prediction of the next pose."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tgslam.geometry import inverse, se3_exp, se3_log
+
+
+class ConstantVelocity:
+    """Predicts T_cw by repeating the last motion, scaled by the time between frames."""
+
+    def __init__(self) -> None:
+        self._last: tuple[float, NDArray[np.float64]] | None = None
+        self._velocity = np.zeros(6)  # rad/s, m/s
+
+    def predict(self, timestamp_s: float) -> NDArray[np.float64]:
+        """T_cw [4, 4] at that time."""
+        if self._last is None:
+            return np.eye(4)
+        last_s, T_cw = self._last
+        return se3_exp(self._velocity * (timestamp_s - last_s)) @ T_cw
+
+    def update(self, timestamp_s: float, T_cw: NDArray[np.float64]) -> None:
+        """Take in a tracked pose."""
+        if self._last is not None and timestamp_s > self._last[0]:
+            self._velocity = se3_log(T_cw @ inverse(self._last[1])) / (timestamp_s - self._last[0])
+        self._last = (timestamp_s, T_cw)
+
+    def stop(self) -> None:
+        """Forget the velocity, after tracking was lost."""
+        self._velocity = np.zeros(6)
