@@ -69,7 +69,7 @@ def run(
     read_ahead: decode the next frame in a thread meanwhile; only for a source that does not use the kernels itself.
     refine: call `finish`; never done after a request to stop.
     stop_requested: asked before each frame; when true, the run ends there and writes what it has.
-    Raises TrackingError when no frame at all could be tracked. When anything is raised, no result file exists, but the
+    Raises TrackingError when no frame at all could be tracked. When anything is raised, there is no map.ply, but the
     poses and the map up to there are kept as partial_trajectory.txt and partial_map.ply where that is possible.
     """
     try:
@@ -79,12 +79,12 @@ def run(
             start_s = time.perf_counter()
             system.finish()
             summary = replace(summary, finish_s=time.perf_counter() - start_s)
+        write_trajectory(folder.trajectory, system.trajectory())
+        write_trajectory(folder.keyframes, system.keyframe_trajectory())
+        write_map(folder.map, system.gaussians())
     except Exception:
         _save_partial(system, folder)
         raise
-    write_trajectory(folder.trajectory, system.trajectory())
-    write_trajectory(folder.keyframes, system.keyframe_trajectory())
-    write_map(folder.map, system.gaussians())
     return summary
 
 
@@ -179,4 +179,5 @@ def _save_partial(system: System, folder: RunFolder) -> None:
     """Keep what there is of a run that failed; the failure itself is what the user hears about."""
     with contextlib.suppress(Exception):  # whatever went wrong may have left the system in any state
         write_trajectory(folder.partial_trajectory, system.trajectory())
+    with contextlib.suppress(Exception):
         write_map(folder.partial_map, system.gaussians())

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 
 from tgslam.config.schema import Config
 from tgslam.evaluation.protocol import Render
@@ -21,7 +23,8 @@ def start_device(name: str) -> str:
     """Start the kernels on device `name` and return the one in use. Raises DeviceError."""
     from tgslam.runtime import Device, start
 
-    return start(Device(name)).value
+    with contextlib.redirect_stdout(io.StringIO()):  # Taichi prints a line that belongs to no result
+        return start(Device(name)).value
 
 
 def make_system(camera: Camera, config: Config) -> System:

@@ -1,0 +1,140 @@
+"""Who may import whom, read off the syntax trees: the layers of the design, kept by a test."""
+
+from __future__ import annotations
+
+import ast
+import graphlib
+import sys
+from pathlib import Path
+
+import pytest
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+
+# The units of tgslam from the bottom up: a unit imports from its own line or one above it here, and never in a circle.
+RANKS = (
+    {"errors", "geometry", "types"},
+    {"kernels", "configs", "config"},
+    {"runtime"},
+    {"arrays", "gaussian_map", "images", "losses", "optim", "plane_fit", "render"},  # op wrappers
+    {"closures", "mapping", "planes", "pose_graph", "synthetic", "tracking"},
+    {"datasets", "slam"},
+    {"evaluation", "output"},
+    {"pipeline"},
+    {"cli"},
+    {"__main__"},
+)
+RANK = {name: rank for rank, names in enumerate(RANKS) for name in names}
+SYSTEM = {"slam", "tracking", "mapping", "planes", "closures", "pose_graph"}  # what must never see ground truth
+
+
+def modules() -> dict[str, ast.Module]:
+    """Dotted name below tgslam (kernels.simd, slam, config.loader) -> its syntax tree."""
+    trees = {}
+    for folder, prefix in (
+        (CHECKOUT / "tgslam", ""),
+        (CHECKOUT / "kernels", "kernels."),
+        (CHECKOUT / "configs", "configs."),
+    ):
+        for path in sorted(folder.rglob("*.py")):
+            name = prefix + ".".join(path.relative_to(folder).with_suffix("").parts)
+            trees[name.removesuffix(".__init__") or "__init__"] = ast.parse(path.read_text(encoding="utf-8"))
+    return trees
+
+
+MODULES = modules()
+
+
+def imports(tree: ast.Module) -> set[str]:
+    """Every module that the tree imports, at any depth; `from tgslam import render` counts as tgslam.render."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute"
+            inner = node.module in ("tgslam", "tgslam.kernels")
+            found |= {f"{node.module}.{alias.name}" for alias in node.names} if inner else {str(node.module)}
+    return found
+
+
+def parts(module: str) -> str:
+    """The unit of tgslam that a module belongs to: `tgslam.config.loader` -> config."""
+    return module.removeprefix("tgslam.").split(".")[0]
+
+
+def external(tree: ast.Module) -> set[str]:
+    """Top-level names of third-party packages."""
+    tops = {name.split(".")[0] for name in imports(tree)}
+    return tops - set(sys.stdlib_module_names) - {"tgslam", "__future__"}
+
+
+def units_imported(name: str) -> set[str]:
+    """The other units that a module imports."""
+    targets = {target for target in imports(MODULES[name]) if target.startswith("tgslam.")}
+    return {parts(target) for target in targets} - {parts(name), "__version__"}
+
+
+def test_every_unit_has_its_place_in_the_layers() -> None:
+    unknown = {parts(name) for name in MODULES} - set(RANK) - {"__init__"}
+    assert not unknown, f"add {unknown} to RANKS"
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_imports_point_one_way(name: str) -> None:
+    above = {unit for unit in units_imported(name) if RANK.get(unit, 0) > RANK.get(parts(name), 0)}
+    assert not above, f"{name} imports from the layers above it: {above}"
+
+
+def test_no_unit_imports_itself_in_a_circle() -> None:
+    graph: dict[str, set[str]] = {}
+    for name in MODULES:
+        graph.setdefault(parts(name), set()).update(units_imported(name))
+    graphlib.TopologicalSorter(graph).prepare()  # raises CycleError that names the circle
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if parts(name) == "kernels"])
+def test_kernels_are_taichi_and_nothing_else(name: str) -> None:
+    tree = MODULES[name]
+    assert external(tree) <= {"taichi"}
+    allowed = {"__future__", "math", "taichi"}
+    for target in imports(tree):
+        assert target in allowed or target.split(".")[0] == "taichi" or target.startswith("tgslam.kernels"), target
+
+
+@pytest.mark.parametrize("name", ["types", "geometry", "errors"])
+def test_types_and_geometry_need_numpy_only(name: str) -> None:
+    assert external(MODULES[name]) <= {"numpy"}
+
+
+def test_one_module_starts_taichi() -> None:
+    def calls_init(tree: ast.Module) -> bool:
+        calls = (node.func for node in ast.walk(tree) if isinstance(node, ast.Call))
+        return any(
+            isinstance(call, ast.Attribute)
+            and call.attr == "init"
+            and isinstance(call.value, ast.Name)
+            and call.value.id in ("ti", "taichi")
+            for call in calls
+        )
+
+    assert [name for name, tree in MODULES.items() if calls_init(tree)] == ["runtime"]
+
+
+def test_gtsam_stays_in_the_pose_graph() -> None:
+    assert {name for name, tree in MODULES.items() if "gtsam" in external(tree)} <= {"pose_graph"}
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if parts(name) in SYSTEM])
+def test_the_system_cannot_reach_ground_truth(name: str) -> None:
+    forbidden = {"datasets", "evaluation", "output", "pipeline", "cli", "synthetic"}
+    seen: set[str] = set()
+    todo = [name]
+    while todo:
+        for target in imports(MODULES[todo.pop()]):
+            inner = target.removeprefix("tgslam.")
+            if target.startswith("tgslam.") and inner not in seen:
+                seen.add(inner)
+                assert parts(inner) not in forbidden, f"{name} reaches {inner}"
+                if inner in MODULES:
+                    todo.append(inner)
