@@ -27,7 +27,7 @@ class SyntheticSource:
     def __init__(self, config: SyntheticConfig, seed: int) -> None:
         """Raises ConfigError for an unknown scene. seed: of the sensor's noise; the scenes themselves never change."""
         spec = scene_spec(config.scene)
-        self.name = f"synthetic/{config.scene}"
+        self.name = f"synthetic-{config.scene}"
         self.camera = synthetic_camera(config.width, config.height)
         self._config, self._seed = config, seed
         self._scene, self._path = spec.build(config.frames / FRAME_RATE_HZ)
