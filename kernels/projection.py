@@ -54,6 +54,15 @@ def clamped(ratio, centre, focal, size):
     return ti.min(ti.max(ratio, low), high)
 
 
+@ti.func
+def blurred_determinant(ax: ti.template(), ay: ti.template()):
+    """det of the screen covariance A A^T + BLUR I, by Lagrange's identity for det(A A^T).
+
+    cxx cyy - cxy^2 cancels to nothing in float32 for a long thin splat across the pixel grid; this sums positive terms.
+    """
+    return ax.cross(ay).norm_sqr() + BLUR * (ax.norm_sqr() + ay.norm_sqr() + BLUR)
+
+
 @ti.kernel
 def project(
     count: ti.i32,
@@ -93,7 +102,7 @@ def project(
             ay = ti.Vector([fy * inv_z * M[1, k] + jy * M[2, k] for k in range(3)])
             mz = ti.Vector([M[2, 0], M[2, 1], M[2, 2]])
             cxx, cxy, cyy = ax.dot(ax) + BLUR, ax.dot(ay), ay.dot(ay) + BLUR
-            inv_det = 1.0 / ti.max(cxx * cyy - cxy * cxy, 1e-12)
+            inv_det = 1.0 / blurred_determinant(ax, ay)
             qxx, qxy, qyy = cyy * inv_det, -cxy * inv_det, cxx * inv_det
             szu, szv = mz.dot(ax), mz.dot(ay)
             u, v = fx * x[0] * inv_z + camera[2], fy * x[1] * inv_z + camera[3]
@@ -166,7 +175,7 @@ def project_backward(
                 ax = ti.Vector([j0 * M[0, k] + jx * M[2, k] for k in range(3)])
                 ay = ti.Vector([j1 * M[1, k] + jy * M[2, k] for k in range(3)])
                 cxx, cxy, cyy = ax.dot(ax) + BLUR, ax.dot(ay), ay.dot(ay) + BLUR
-                inv_det = 1.0 / ti.max(cxx * cyy - cxy * cxy, 1e-12)
+                inv_det = 1.0 / blurred_determinant(ax, ay)
                 qxx, qxy, qyy = cyy * inv_det, -cxy * inv_det, cxx * inv_det
                 szu, szv = mz.dot(ax), mz.dot(ay)
                 # Inverse covariance and depth slopes -> covariance and its products with the z row
