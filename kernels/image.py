@@ -141,27 +141,24 @@ def gate(
 def inverse_depth_blocks(
     depth: F2,  # [H, W] m, 0 = none
     relative: ti.f32,
-    blocks: F2,  # [ceil(H / 2), ceil(W / 2)] 1/m, 0 = none, out
+    blocks: F2,  # [H // 2, W // 2] 1/m, 0 = none, out
 ):
-    """Mean inverse depth of the nearest surface in each 2x2 block (smaller blocks at an odd last row or column)."""
+    """Mean inverse depth of the nearest surface in each 2x2 block."""
     for s in range(blocks.shape[0] * SPLIT):
         i, begin, end = segment(s, blocks.shape[1])
         for j in range(begin, end):
             nearest = 0.0
+            for k in ti.static(range(4)):
+                z = depth[2 * i + k // 2, 2 * j + k % 2]
+                nearest = ti.max(nearest, ti.select(z > 0.0, 1.0 / ti.max(z, 1e-6), 0.0))
             total = 0.0
             count = 0.0
-            for pick in ti.static(range(2)):
-                for k in ti.static(range(4)):
-                    r, c = 2 * i + k // 2, 2 * j + k % 2
-                    z = depth[ti.min(r, depth.shape[0] - 1), ti.min(c, depth.shape[1] - 1)]
-                    inside = (r < depth.shape[0]) and (c < depth.shape[1]) and (z > 0.0)
-                    w = ti.select(inside, 1.0 / ti.max(z, 1e-6), 0.0)
-                    if ti.static(pick == 0):
-                        nearest = ti.max(nearest, w)
-                    else:
-                        keep = ti.select(inside and (w >= nearest * (1.0 - relative)), 1.0, 0.0)
-                        total += keep * w
-                        count += keep
+            for k in ti.static(range(4)):
+                z = depth[2 * i + k // 2, 2 * j + k % 2]
+                w = 1.0 / ti.max(z, 1e-6)
+                keep = ti.select((z > 0.0) and (w >= nearest * (1.0 - relative)), 1.0, 0.0)
+                total += keep * w
+                count += keep
             blocks[i, j] = total / ti.max(count, 1.0)
 
 
@@ -174,18 +171,23 @@ def fit_block(blocks: ti.template(), i, j, radius, noise, slope):
     centre = blocks[i, j]
     n, sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     sw, sxw, syw, sww = 0.0, 0.0, 0.0, 0.0
+    first, last = ti.max(j - radius, 0), ti.min(j + radius, blocks.shape[1] - 1)
     for r in range(ti.max(i - radius, 0), ti.min(i + radius, blocks.shape[0] - 1) + 1):
         y = ti.cast(r - i, ti.f32)
-        for c in range(ti.max(j - radius, 0), ti.min(j + radius, blocks.shape[1] - 1) + 1):
+        row_n, row_x, row_w, row_xw = 0.0, 0.0, 0.0, 0.0
+        for c in range(first, last + 1):
             x = ti.cast(c - j, ti.f32)
             w = blocks[r, c]
             d = w - centre
-            reach = noise + slope * centre * ti.max(ti.abs(x), ti.abs(y))
-            keep = ti.select((w > 0.0) and (ti.abs(d) <= reach), 1.0, 0.0)
-            kx, ky, kd = keep * x, keep * y, keep * d
-            n, sx, sy, sw = n + keep, sx + kx, sy + ky, sw + kd
-            sxx, sxy, syy = sxx + kx * x, sxy + kx * y, syy + ky * y
-            sxw, syw, sww = sxw + kd * x, syw + kd * y, sww + kd * d
+            if w > 0.0 and ti.abs(d) <= noise + slope * centre * ti.max(ti.abs(x), ti.abs(y)):
+                row_n += 1.0
+                row_x += x
+                row_w += d
+                row_xw += d * x
+                sxx += x * x
+                sww += d * d
+        n, sx, sy, sw = n + row_n, sx + row_x, sy + row_n * y, sw + row_w
+        sxy, syy, sxw, syw = sxy + row_x * y, syy + row_n * y * y, sxw + row_xw, syw + row_w * y
     mean = 1.0 / ti.max(n, 1.0)
     cxx, cxy, cyy = sxx - sx * sx * mean, sxy - sx * sy * mean, syy - sy * sy * mean
     cxw, cyw, cww = sxw - sx * sw * mean, syw - sy * sw * mean, sww - sw * sw * mean
@@ -202,7 +204,7 @@ def fit_block(blocks: ti.template(), i, j, radius, noise, slope):
 @ti.kernel
 def normals(
     depth: F2,  # [H, W] m, 0 = none
-    blocks: F2,  # [ceil(H / 2), ceil(W / 2)] 1/m
+    blocks: F2,  # [H // 2, W // 2] 1/m
     fx: ti.f32,
     fy: ti.f32,
     cx: ti.f32,
@@ -223,9 +225,8 @@ def normals(
             nx, ny, nz = a * fx, b * fy, w0 - a * (u - cx) - b * (v - cy)
             length = ti.sqrt(nx * nx + ny * ny + nz * nz)
             good = (w0 > 0.0) and (fit[3] <= 4.0 * sigma * sigma + 1e-5 * w0 * w0)
-            for k in ti.static(range(4)):
-                r, c = 2 * i + k // 2, 2 * j + k % 2
-                if r < depth.shape[0] and c < depth.shape[1]:
+            for r in range(2 * i, ti.select(i + 1 < blocks.shape[0], 2 * i + 2, depth.shape[0])):
+                for c in range(2 * j, ti.select(j + 1 < blocks.shape[1], 2 * j + 2, depth.shape[1])):
                     z = depth[r, c]
                     expected = w0 + a * (c - u) + b * (r - v)
                     near = ti.abs(1.0 / ti.max(z, 1e-6) - expected) <= 4.0 * sigma + 0.01 * w0

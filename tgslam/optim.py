@@ -40,7 +40,7 @@ class Adam:
             raise ValueError(f"groups {sorted(channels)} need learning rates, but got {sorted(learning_rates)}")
         self.learning_rates = dict(learning_rates)
         self._channels = dict(channels)
-        self._betas, self._epsilon = betas, epsilon
+        self._gains, self._epsilon = (1.0 - betas[0], 1.0 - betas[1]), epsilon
         self._rows = rows
         self._correction = runtime.to_device(_corrections(*betas))
         self._allocate(max(rows, _MIN_CAPACITY))
@@ -79,7 +79,7 @@ class Adam:
         for group, parameter in parameters.items():
             update = kernels.adam_rows if self._channels[group] else kernels.adam_scalars
             update(
-                self._rows, self.learning_rates[group], *self._betas, self._epsilon, self._correction, self._steps,
+                self._rows, self.learning_rates[group], *self._gains, self._epsilon, self._correction, self._steps,
                 visible, gradients[group], parameter, self._m[group], self._v[group],
             )  # fmt: skip
 

@@ -1,0 +1,162 @@
+"""Image kernels against their float64 twins, and normals against true planes."""
+
+import numpy as np
+import pytest
+
+from tests.reference import image as reference
+from tgslam import images, runtime
+from tgslam.types import Camera
+
+SIZES = [(48, 64), (37, 51), (2, 3), (700, 5)]
+VGA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(11)
+
+
+def plane_depth(camera, normal, distance_m):
+    """Depth of the plane normal . p + distance = 0 in the camera frame."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    return -distance_m / (rays @ normal)
+
+
+def facing(angle_deg, towards_deg=0.0):
+    """Unit normal towards the camera, tilted off the optical axis."""
+    a, b = np.radians([angle_deg, towards_deg])
+    return -np.array([np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)])
+
+
+def errors_deg(found, normal):
+    """Angles of the valid normals to the true one, and the share of pixels that have one."""
+    valid = np.linalg.norm(found, axis=2) > 0.5
+    cosine = np.clip(found[valid].astype(float) @ normal, -1, 1)
+    return np.degrees(np.arccos(cosine)), valid.mean()
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_luminance_halving_and_sobel_match_the_twin(rng, size):
+    colour = rng.random((*size, 3), np.float32)
+    grey = images.luminance(runtime.to_device(colour))
+    np.testing.assert_allclose(runtime.to_host(grey), reference.luminance(colour.astype(float)), atol=1e-6)
+    for image in (colour, runtime.to_host(grey)):
+        half = runtime.to_host(images.halve(runtime.to_device(image)))
+        np.testing.assert_allclose(half, reference.halve(image.astype(float)), atol=1e-6)
+    expected = reference.sobel(runtime.to_host(grey).astype(float))
+    for found, want in zip(images.sobel(grey), expected, strict=True):
+        np.testing.assert_allclose(runtime.to_host(found), want, atol=1e-6)
+    np.testing.assert_allclose(runtime.to_host(images.sobel_magnitude(grey)), np.hypot(*expected), atol=1e-6)
+
+
+def test_sobel_of_a_ramp_is_its_slope():
+    v, u = np.mgrid[:20, :30]
+    grad_x, grad_y = images.sobel(runtime.to_device(0.02 * u - 0.01 * v))
+    np.testing.assert_allclose(runtime.to_host(grad_x)[1:-1, 1:-1], 0.02, atol=1e-6)
+    np.testing.assert_allclose(runtime.to_host(grad_y)[1:-1, 1:-1], -0.01, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_halved_depth_matches_the_twin(rng, size):
+    depth = rng.choice([1.0, 1.02, 1.049, 1.06, 2.0, 2.05, 0.0], size).astype(np.float32)
+    half = runtime.to_host(images.halve_depth(runtime.to_device(depth), 0.05))
+    np.testing.assert_allclose(half, reference.halve_depth(depth.astype(float), 0.05), rtol=1e-6)
+
+
+def test_halved_depth_never_mixes_surfaces():
+    depth = np.full((8, 8), 3.0, np.float32)
+    depth[:, :3] = 1.0
+    depth[0, :] = 0
+    half = runtime.to_host(images.halve_depth(runtime.to_device(depth)))
+    assert set(np.unique(half)) == {1.0, 3.0}
+    assert not runtime.to_host(images.halve_depth(runtime.zeros((6, 6)))).any()
+
+
+@pytest.mark.parametrize("size", [(48, 64), (37, 51), (300, 261)])
+def test_gate_matches_the_twin(rng, size):
+    v, u = np.mgrid[: size[0], : size[1]]
+    grey = np.float32(0.5 + 0.3 * np.sin(0.02 * u * (u > size[1] // 2)) + 0.05 * rng.random(size))
+    found = runtime.to_host(images.texture_gate(runtime.to_device(grey), 90.0, 0.004))
+    np.testing.assert_allclose(found, reference.texture_gate(grey.astype(float), 90.0, 0.004), atol=1e-4)
+    assert found.min() == 0 and found.max() == 1
+
+
+def test_gate_of_a_constant_image_is_one_and_of_faint_noise_stays_high(rng):
+    assert (runtime.to_host(images.texture_gate(runtime.to_device(np.full((30, 40), 0.3)))) == 1).all()
+    noise = 0.5 + 0.004 * rng.normal(size=(240, 320))
+    assert runtime.to_host(images.texture_gate(runtime.to_device(noise))).mean() > 0.85
+
+
+def test_gate_survives_one_strong_edge(rng):
+    grey = 0.5 + 0.1 * np.sin(np.arange(160)[None, :] * 0.8) * np.ones((120, 1))
+    with_edge = grey.copy()
+    with_edge[60:] += 5.0
+    gates = [runtime.to_host(images.texture_gate(runtime.to_device(image))) for image in (grey, with_edge)]
+    np.testing.assert_allclose(gates[0][:50], gates[1][:50], atol=0.05)
+
+
+def test_normals_match_the_twin(rng):
+    camera = Camera(45, 33, 40.0, 42.0, 21.0, 17.0)
+    depth = plane_depth(camera, facing(25, 70), 1.2)
+    depth[:, 30:] = plane_depth(camera, facing(40, 200), 2.0)[:, 30:]
+    depth += 0.0015 * depth**2 * rng.normal(size=depth.shape)
+    depth[rng.random(depth.shape) < 0.1] = 0
+    depth = depth.astype(np.float32)
+    found = runtime.to_host(images.normals(runtime.to_device(depth), camera, radius=2))
+    expected = reference.normals(depth.astype(float), camera, 2, 0.0015, 1.3, images.DEPTH_EDGE)
+    differ = np.linalg.norm(found - expected, axis=2) > 2e-3
+    assert differ.mean() < 0.002  # a pixel at a threshold may fall on either side
+    assert (np.linalg.norm(expected, axis=2) > 0.5).mean() > 0.7
+
+
+@pytest.mark.parametrize("normal", [facing(0), facing(30, 45), facing(60, 180), np.array([0.0, -1.0, 0.05])])
+def test_normals_of_exact_planes_are_exact(normal):
+    normal = normal / np.linalg.norm(normal)
+    camera = Camera(160, 121, 130.0, 131.0, 80.0, 10.0)
+    depth = plane_depth(camera, normal, 1.5)
+    depth[(depth < 0.2) | (depth > 6)] = 0
+    found = runtime.to_host(images.normals(runtime.to_device(depth), camera))
+    errors, share = errors_deg(found, normal)
+    assert errors.max() < 0.1
+    assert share > 0.75 * (depth > 0).mean()
+
+
+@pytest.mark.parametrize(("distance_m", "limit_deg"), [(1.0, 1.5), (2.0, 3.5), (3.0, 6.0)])
+def test_normals_of_a_noisy_plane(rng, distance_m, limit_deg):
+    normal = facing(20, 30)
+    depth = plane_depth(VGA, normal, distance_m)
+    depth += 0.0015 * depth**2 * rng.normal(size=depth.shape)
+    depth[rng.random(depth.shape) < 0.03] = 0
+    errors, share = errors_deg(runtime.to_host(images.normals(runtime.to_device(depth), VGA)), normal)
+    assert np.median(errors) < limit_deg
+    assert share > 0.94
+
+
+def test_normals_do_not_reach_across_an_edge(rng):
+    depth = plane_depth(VGA, facing(0), 1.0)
+    depth[:, 320:] = plane_depth(VGA, facing(35), 2.0)[:, 320:]
+    found = runtime.to_host(images.normals(runtime.to_device(depth), VGA))
+    for half, normal in ((found[:, :320], facing(0)), (found[:, 320:], facing(35))):
+        errors, share = errors_deg(half, normal)
+        assert errors.max() < 0.5 and share > 0.98
+
+
+def test_normals_without_depth_are_zero():
+    assert not runtime.to_host(images.normals(runtime.zeros((480, 640)), VGA)).any()
+    lone = runtime.zeros((480, 640))
+    lone[100, 100] = 1.0
+    assert not runtime.to_host(images.normals(lone, VGA)).any()
+
+
+def test_wrong_images_are_named():
+    with pytest.raises(ValueError, match=r"colour must have shape \[any, any, 3\]"):
+        images.luminance(runtime.zeros((4, 4)))
+    with pytest.raises(ValueError, match="image must be float32"):
+        images.sobel(np.zeros((4, 4)))
+    with pytest.raises(ValueError, match="C-contiguous"):
+        images.sobel(np.zeros((4, 8), np.float32)[:, ::2])
+    with pytest.raises(ValueError, match="cannot be halved"):
+        images.halve(runtime.zeros((1, 4)))
+    with pytest.raises(ValueError, match="out must have shape"):
+        images.luminance(runtime.zeros((4, 4, 3)), runtime.zeros((4, 5)))
