@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -28,6 +30,15 @@ class World:
         self.source = FakeSource()
         self.system = FakeSystem()
         self.opened_with: list[object] = []
+
+
+@pytest.fixture(autouse=True)
+def package_logger() -> Iterator[None]:
+    """`main` sets up the package's logger; other tests want it as it was."""
+    logger = logging.getLogger("tgslam")
+    before = list(logger.handlers), logger.level, logger.propagate
+    yield
+    logger.handlers[:], logger.level, logger.propagate = before
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ RANKS = (
     {"kernels", "configs", "config"},
     {"runtime"},
     {"arrays", "gaussian_map", "images", "losses", "optim", "plane_fit", "render"},  # op wrappers
-    {"closures", "mapping", "planes", "pose_graph", "synthetic", "tracking"},
+    {"closures", "keyframes", "mapping", "planes", "pose_graph", "synthetic", "tracking"},
     {"datasets", "slam"},
     {"evaluation", "output"},
     {"pipeline"},
@@ -25,7 +25,15 @@ RANKS = (
     {"__main__"},
 )
 RANK = {name: rank for rank, names in enumerate(RANKS) for name in names}
-SYSTEM = {"slam", "tracking", "mapping", "planes", "closures", "pose_graph"}  # what must never see ground truth
+SYSTEM = {
+    "slam",
+    "keyframes",
+    "tracking",
+    "mapping",
+    "planes",
+    "closures",
+    "pose_graph",
+}  # what must never see ground truth
 
 
 def modules() -> dict[str, ast.Module]:

@@ -36,19 +36,20 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def expected_files() -> set[str]:
+def expected_files(sources: Path) -> set[str]:
+    """What a wheel of the tree at `sources` has to hold."""
     found = set()
     for name in FOLDERS:
-        for path in (CHECKOUT / name).rglob("*"):
+        for path in (sources / name).rglob("*"):
             if path.suffix in (".py", ".yaml") or path.name == "py.typed":
-                inner = path.relative_to(CHECKOUT)
+                inner = path.relative_to(sources)
                 found.add((inner if name == "tgslam" else Path("tgslam") / inner).as_posix())
     return found
 
 
 def test_a_wheel_holds_every_module_and_config_under_tgslam(wheel: Path) -> None:
     names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
-    assert names == expected_files()
+    assert names == expected_files(wheel.parents[1])
     assert "tgslam/kernels/__init__.py" in names
     assert "tgslam/configs/tum.yaml" in names
 
