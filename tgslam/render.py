@@ -150,6 +150,21 @@ class Rasterizer:
         depth_m = np.where(opacity >= MIN_OPACITY, depth / np.maximum(opacity, MIN_OPACITY), 0.0).astype(np.float32)
         return Rendering(runtime.to_host(images.colour).copy(), depth_m, opacity)
 
+    @property
+    def tile_count(self) -> np.ndarray:
+        """[capacity] int32 device array: tiles that each Gaussian touched in the last `forward`, 0 = not rendered."""
+        return self._splats.tile_count
+
+    @property
+    def splat(self) -> np.ndarray:
+        """[capacity, SPLAT] device array of the last `forward`, columns as in `kernels.projection`."""
+        return self._splats.splat
+
+    @property
+    def splat_grad(self) -> np.ndarray:
+        """[capacity, SPLAT_GRAD] device array of the last `backward`."""
+        return self._splats.grad
+
     def visible(self, count: int) -> NDArray[np.bool_]:
         """[count] which Gaussians the last `forward` found inside the image."""
         return runtime.to_host(self._splats.tile_count)[:count] > 0

@@ -80,7 +80,7 @@ class TrackingConfig:
     max_distance_sigmas: float = setting(15.0, 1.0, 1000.0)  # depth residuals beyond are no match
     exposure_prior: float = setting(1000.0, 0.0, 1e9)  # how strongly gain 1 and bias 0 are believed, in pixels
     min_opacity: float = setting(0.8, 0.0, 1.0)  # model pixels less covered are not used
-    first_order_iterations: int = setting(40, 1, 1000)
+    first_order_iterations: tuple[int, ...] = setting((20, 20))  # Adam steps by level, fine to coarse
     first_order_rate: float = setting(0.001, 1e-6, 1.0)  # Adam step, rad and m
     lost_inlier_ratio: float = setting(0.3, 0.0, 1.0)  # fewer matched pixels with a residual below 3 sigma: lost
     lost_overlap: float = setting(0.1, 0.0, 1.0)  # fewer live pixels that meet the map: lost
@@ -129,7 +129,8 @@ class MappingConfig:
     rate_opacity: float = setting(0.03, 0.0, 10.0)  # in logit
     rate_colour: float = setting(0.01, 0.0, 1.0)  # only with optimizer: adam
     rate_pose: float = setting(0.0003, 0.0, 1.0)  # rad and m
-    relaxation: float = setting(0.7, 0.0, 1.9)  # 1 = the full step
+    relaxation: float = setting(0.7, 0.0, 1.9)  # of colours; 1 = the full step
+    relaxation_depth: float = setting(0.3, 0.0, 1.9)  # of depths: below 1, noisy views average
 
 
 @dataclass(frozen=True)

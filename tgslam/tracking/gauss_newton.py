@@ -52,13 +52,27 @@ class GaussNewtonTracker:
             model = self._model(gaussians, T_cw)
             T_ml, exposure, last = self._align(live, model, exposure)
             T_cw = inverse(T_ml) @ T_cw
+        return self._result(T_cw, T_ml, exposure, last)
+
+    def assess(self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure) -> TrackingResult:
+        """What the frame says of a pose that another solver found; the pose stays as it is."""
+        live = live_pyramid(frame, self.camera, self.first, 1, self.loss.gate_percentile)
+        equations = self._linearise(live[0], self._model(gaussians, T_cw)[0], np.eye(4), exposure)
+        return self._result(T_cw, np.eye(4), exposure, equations)
+
+    def _result(
+        self, T_cw: NDArray[np.float64], T_ml: NDArray[np.float64], exposure: Exposure, last: NormalEquations
+    ) -> TrackingResult:
         information = adjoint(T_ml).T @ last.A[:6, :6] @ adjoint(T_ml)
         measures = {
             "inlier_ratio": last.inliers / max(last.matched, 1.0),
             "overlap": last.matched / max(last.live_pixels, 1.0),
+            "unexplained": 1.0 - last.candidates / max(last.live_pixels, 1.0),
             "depth_residual_sigmas": last.depth_residual,
             "colour_residual": last.colour_residual,
             "condition": float(np.linalg.cond(information)),
+            "gain": exposure.gain,
+            "bias": exposure.bias,
         }
         message = evidence_against(measures, self.config)
         return TrackingResult(T_cw, exposure, information, bool(message), message, measures)

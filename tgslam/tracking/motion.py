@@ -28,6 +28,6 @@ class ConstantVelocity:
             self._velocity = se3_log(T_cw @ inverse(self._last[1])) / (timestamp_s - self._last[0])
         self._last = (timestamp_s, T_cw)
 
-    def stop(self) -> None:
-        """Forget the velocity, after tracking was lost."""
-        self._velocity = np.zeros(6)
+    def slow_down(self) -> None:
+        """Believe in half the velocity: where tracking is lost, the last one soon tells nothing."""
+        self._velocity = self._velocity / 2.0

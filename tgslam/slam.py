@@ -1,0 +1,154 @@
+"""The system on one screen: track each frame against the map, choose keyframes, grow and refine the map (Fig. 2)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tgslam.config.schema import Config
+from tgslam.errors import FrameError
+from tgslam.geometry import inverse, orthonormalized
+from tgslam.keyframes import KeyframeSelector
+from tgslam.mapping.keyframe import Keyframe
+from tgslam.mapping.mapper import Mapper
+from tgslam.tracking.motion import ConstantVelocity
+from tgslam.tracking.result import Exposure, TrackingResult
+from tgslam.tracking.solver import make_tracker, track_or_recover
+from tgslam.types import Camera, Frame, FrameReport, FrameStatus, Gaussians, Trajectory
+
+_MIN_DEPTH_SHARE = 0.01  # a frame with depth in fewer of its pixels is not usable
+_FALLBACKS = 3  # latest keyframes from which a lost camera is sought
+
+
+@dataclass(frozen=True)
+class _Posed:
+    """A frame's pose relative to its keyframe, so that refining the keyframe moves the frame with it."""
+
+    timestamp_s: float
+    keyframe: Keyframe
+    T_ck: NDArray[np.float64]  # [4, 4] keyframe's camera to the frame's
+
+
+class Slam:
+    """RGB-D frames in; poses and a Gaussian map out. The first frame's camera is the world frame."""
+
+    def __init__(self, camera: Camera, config: Config) -> None:
+        self.camera = camera
+        self.tracker = make_tracker(camera, config.tracking, config.loss)
+        self.motion = ConstantVelocity()
+        self.selector = KeyframeSelector(config.keyframes)
+        rng = np.random.default_rng(config.seed)
+        self.mapper = Mapper(camera, config.mapping, config.seeding, config.loss, rng)
+        self.exposure = Exposure()
+        self._posed: list[_Posed] = []
+        self._stage_s: dict[str, float] = {}
+
+    def process_frame(self, frame: Frame) -> FrameReport:
+        """Estimate the frame's pose and, if it shows something new, map it. Frames come in order of time.
+
+        Raises FrameError, with nothing changed, for a frame with next to no depth or of another size than the camera's.
+        """
+        self._check(frame)
+        self._stage_s = {}
+        if not self.mapper.keyframes:
+            first = TrackingResult(np.eye(4), Exposure(), np.eye(6), lost=False)
+            self._map(frame, first)
+            return self._report(frame, FrameStatus.INITIAL, "first frame", first)
+        with self._stage("track"):
+            result = self._track(frame)
+        with self._stage("select"):
+            cue = "" if result.lost else self._keyframe_cue(frame, result)
+        if cue:
+            self._map(frame, result)
+        else:
+            self._remember(frame, result.T_cw)
+        self._follow(frame, result)
+        return self._report(frame, FrameStatus.LOST if result.lost else FrameStatus.TRACKED, cue, result)
+
+    def finish(self) -> None:
+        """The final refinement of the map, after the last frame."""
+        if self.mapper.keyframes:
+            self.mapper.finish()
+
+    def trajectory(self) -> Trajectory:
+        """Camera-to-world poses of every frame that was given."""
+        poses = [inverse(posed.T_ck @ posed.keyframe.T_cw) for posed in self._posed]
+        return _trajectory([posed.timestamp_s for posed in self._posed], poses)
+
+    def keyframe_trajectory(self) -> Trajectory:
+        """Camera-to-world poses of the keyframes."""
+        keyframes = self.mapper.keyframes
+        return _trajectory([k.timestamp_s for k in keyframes], [inverse(k.T_cw) for k in keyframes])
+
+    def keyframe_indices(self) -> list[int]:
+        """`Frame.index` of the keyframes."""
+        return [keyframe.index for keyframe in self.mapper.keyframes]
+
+    def gaussians(self) -> Gaussians:
+        """The map, on the host."""
+        return self.mapper.gaussians.gaussians()
+
+    def _track(self, frame: Frame) -> TrackingResult:
+        predicted = self.motion.predict(frame.timestamp_s)
+        latest = self._posed[-1]
+        fallbacks = [latest.T_ck @ latest.keyframe.T_cw, *(k.T_cw for k in self.mapper.keyframes[: -_FALLBACKS - 1 : -1])]
+        return track_or_recover(self.tracker, frame, self.mapper.gaussians, predicted, fallbacks, self.exposure)
+
+    def _keyframe_cue(self, frame: Frame, result: TrackingResult) -> str:
+        seen = self.tracker.rasterizer.visible(self.mapper.gaussians.count)
+        return self.selector.cue(frame, seen, result.measures["unexplained"])
+
+    def _map(self, frame: Frame, result: TrackingResult) -> None:
+        keyframe = Keyframe.from_frame(frame, result.T_cw, result.exposure, result.information)
+        with self._stage("map"):
+            self.mapper.add_keyframe(keyframe)
+        self._posed.append(_Posed(frame.timestamp_s, keyframe, np.eye(4)))
+        self.tracker.rasterizer.forward(self.mapper.gaussians, keyframe.T_cw)
+        self.selector.reset(frame, self.tracker.rasterizer.visible(self.mapper.gaussians.count))
+
+    def _remember(self, frame: Frame, T_cw: NDArray[np.float64]) -> None:
+        keyframe = self.mapper.keyframes[-1]
+        self._posed.append(_Posed(frame.timestamp_s, keyframe, orthonormalized(T_cw @ inverse(keyframe.T_cw))))
+
+    def _follow(self, frame: Frame, result: TrackingResult) -> None:
+        """The motion model follows the pose as mapping has left it; a lost camera is believed to slow down."""
+        latest = self._posed[-1]
+        self.motion.update(frame.timestamp_s, latest.T_ck @ latest.keyframe.T_cw)
+        if result.lost:
+            self.motion.slow_down()
+        else:
+            self.exposure = result.exposure
+
+    def _check(self, frame: Frame) -> None:
+        size = (self.camera.height, self.camera.width)
+        if frame.depth_m.shape != size or frame.colour.shape != (*size, 3):
+            raise FrameError(f"frame {frame.index}: images of {frame.depth_m.shape} do not fit the camera's {size}")
+        if (frame.depth_m > 0).mean() < _MIN_DEPTH_SHARE:
+            raise FrameError(f"frame {frame.index}: depth in less than {_MIN_DEPTH_SHARE:.0%} of its pixels")
+
+    @contextmanager
+    def _stage(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self._stage_s[name] = self._stage_s.get(name, 0.0) + time.perf_counter() - start
+
+    def _report(self, frame: Frame, status: FrameStatus, cue: str, result: TrackingResult) -> FrameReport:
+        return FrameReport(
+            index=frame.index,
+            timestamp_s=frame.timestamp_s,
+            status=status,
+            is_keyframe=bool(cue),
+            gaussians=self.mapper.gaussians.count,
+            stage_s=dict(self._stage_s),
+            measures=dict(result.measures),
+            message=result.message or cue,
+        )
+
+
+def _trajectory(timestamps_s: list[float], T_wc: list[NDArray[np.float64]]) -> Trajectory:
+    return Trajectory(np.array(timestamps_s, np.float64), np.array(T_wc, np.float64).reshape(-1, 4, 4))

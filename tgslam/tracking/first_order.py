@@ -1,0 +1,78 @@
+"""First-order tracking, as the paper's: render, compare, follow the rasterizer's pose gradient, coarse to fine."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tgslam import images, losses, runtime
+from tgslam.config.schema import LossConfig, TrackingConfig
+from tgslam.gaussian_map import GaussianMap, MapGradient
+from tgslam.geometry import se3_exp
+from tgslam.render import ImageGradient, Rasterizer
+from tgslam.tracking.gauss_newton import GaussNewtonTracker
+from tgslam.tracking.pyramid import finest_level
+from tgslam.tracking.result import Exposure, TrackingResult
+from tgslam.types import Camera, Frame
+from tgslam.vector_adam import VectorAdam
+
+
+class FirstOrderTracker:
+    """Adam on the pose, gain and bias under the whole of Eqs. 10-13, SSIM included."""
+
+    def __init__(self, camera: Camera, config: TrackingConfig, loss: LossConfig) -> None:
+        self.config, self.loss = config, loss
+        self.first = finest_level(camera, config.finest_width_px)
+        self.cameras = [camera.halved(self.first + level) for level in range(len(config.first_order_iterations))]
+        self.rasterizers = [Rasterizer(level) for level in self.cameras]
+        self.workspaces = [losses.Workspace(level.height, level.width) for level in self.cameras]
+        self._gradient = MapGradient.zeros(1)
+        self._judge = GaussNewtonTracker(camera, config, loss)
+        self.rasterizer = self._judge.rasterizer
+
+    def track(
+        self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure
+    ) -> TrackingResult:
+        """Pose of `frame` from the prediction T_cw [4, 4] and the last frame's exposure."""
+        if self._gradient.mean.shape[0] != gaussians.capacity:
+            self._gradient = MapGradient.zeros(gaussians.capacity)
+        observations = self._observations(frame)
+        for level in reversed(range(len(self.cameras))):
+            T_cw, exposure = self._descend(level, observations[level], gaussians, T_cw, exposure)
+        return self._judge.assess(frame, gaussians, T_cw, exposure)
+
+    def _observations(self, frame: Frame) -> list[losses.Observation]:
+        colour, depth_m = runtime.to_device(frame.colour), runtime.to_device(frame.depth_m)
+        for _ in range(self.first):
+            colour, depth_m = images.halve(colour), images.halve_depth(depth_m)
+        result = []
+        for level in range(len(self.cameras)):
+            if level:
+                colour, depth_m = images.halve(colour), images.halve_depth(depth_m)
+            result.append(losses.observe(colour, depth_m, self.loss))
+        return result
+
+    def _descend(
+        self,
+        level: int,
+        observation: losses.Observation,
+        gaussians: GaussianMap,
+        T_cw: NDArray[np.float64],
+        exposure: Exposure,
+    ) -> tuple[NDArray[np.float64], Exposure]:
+        rasterizer = self.rasterizers[level]
+        rate = self.config.first_order_rate
+        adam = VectorAdam([rate] * 8)
+        to_frame = np.array([1.0 / exposure.gain, -exposure.bias / exposure.gain])  # the loss fits map to frame
+        for _ in range(self.config.first_order_iterations[level]):
+            rendered = rasterizer.forward(gaussians, T_cw)
+            result = losses.rgbd_loss(
+                rendered.colour, rendered.depth, rendered.opacity, observation, self.loss, to_frame[0], to_frame[1],
+                min_opacity=self.config.min_opacity, workspace=self.workspaces[level],
+            )  # fmt: skip
+            g = ImageGradient(result.g_colour, result.g_depth, result.g_opacity)
+            g_pose = rasterizer.backward(gaussians, g, self._gradient)
+            step = adam.step(np.concatenate([g_pose, [result.g_gain, result.g_bias]]))
+            T_cw = se3_exp(step[:6]) @ T_cw
+            to_frame = to_frame + step[6:]
+        return T_cw, Exposure(1.0 / to_frame[0], -to_frame[1] / to_frame[0])

@@ -1,0 +1,56 @@
+"""The two solvers behind one interface, and recovery when the first attempt is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tgslam.config.schema import LossConfig, TrackingConfig
+from tgslam.gaussian_map import GaussianMap
+from tgslam.render import Rasterizer
+from tgslam.tracking.first_order import FirstOrderTracker
+from tgslam.tracking.gauss_newton import GaussNewtonTracker
+from tgslam.tracking.result import Exposure, TrackingResult
+from tgslam.types import Camera, Frame
+
+
+class Tracker(Protocol):
+    """A solver for the pose of one frame."""
+
+    rasterizer: Rasterizer  # holds which Gaussians the last model image saw
+
+    def track(
+        self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure
+    ) -> TrackingResult:
+        """Pose of `frame` from the prediction T_cw [4, 4] (world to camera) and the last frame's exposure."""
+        ...
+
+
+def make_tracker(camera: Camera, config: TrackingConfig, loss: LossConfig) -> Tracker:
+    """The solver that the config names."""
+    if config.solver == "first_order":
+        return FirstOrderTracker(camera, config, loss)
+    return GaussNewtonTracker(camera, config, loss)
+
+
+def track_or_recover(
+    tracker: Tracker,
+    frame: Frame,
+    gaussians: GaussianMap,
+    predicted: NDArray[np.float64],
+    fallbacks: Iterable[NDArray[np.float64]],
+    exposure: Exposure,
+) -> TrackingResult:
+    """Track from the prediction, then from each fallback until one holds; if none does, coast on the prediction."""
+    first = tracker.track(frame, gaussians, predicted, exposure)
+    if not first.lost:
+        return first
+    for T_cw in fallbacks:
+        result = tracker.track(frame, gaussians, T_cw, exposure)
+        if not result.lost:
+            return result
+    return replace(first, T_cw=predicted, exposure=exposure)
