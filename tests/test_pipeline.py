@@ -175,6 +175,12 @@ def test_metrics_that_do_not_apply_are_null(folder: RunFolder) -> None:
     assert without["rpe_trans_cm"] is None
 
 
+def test_an_input_that_has_shrunk_is_an_error(folder: RunFolder) -> None:
+    pipeline.run(FakeSource(12), FakeSystem(), folder)
+    with pytest.raises(EvaluationError, match="11 frames now, but this run saw 12"):
+        evaluate_run(folder, EvaluationConfig(), FakeSource(11), None, lambda: fake_render)
+
+
 def test_a_run_without_results_cannot_be_evaluated(folder: RunFolder) -> None:
     with pytest.raises(OutputError, match="did not come to its end"):
         evaluate_run(folder, EvaluationConfig(), None, None, None)

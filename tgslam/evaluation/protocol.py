@@ -38,23 +38,26 @@ def trajectory_metrics(
     """The values of `TRAJECTORY_KEYS`; null, with a logged reason, for what too few poses leave open."""
     tolerance_s = config.association_tolerance_s
 
-    def or_none(compute: Callable[[], Metrics]) -> Metrics:
-        try:
-            return compute()
-        except EvaluationError as error:
-            _log.warning("a trajectory metric is null: %s", error)
-            return {}
+    def absolute(trajectory: Trajectory) -> tuple[float]:
+        return (100.0 * ate(trajectory, groundtruth, tolerance_s).rmse_m,)
 
-    def relative() -> Metrics:
+    def relative() -> tuple[float, float]:
         result = rpe(every_frame, groundtruth, tolerance_s, config.rpe_delta_frames)
-        return {"rpe_trans_cm": 100.0 * result.trans_rmse_m, "rpe_rot_deg": result.rot_rmse_deg}
+        return 100.0 * result.trans_rmse_m, result.rot_rmse_deg
 
     return {
-        **dict.fromkeys(TRAJECTORY_KEYS),
-        **or_none(lambda: {"ate_rmse_cm": 100.0 * ate(keyframes, groundtruth, tolerance_s).rmse_m}),
-        **or_none(lambda: {"ate_rmse_all_cm": 100.0 * ate(every_frame, groundtruth, tolerance_s).rmse_m}),
-        **or_none(relative),
+        **_or_null(("ate_rmse_cm",), lambda: absolute(keyframes)),
+        **_or_null(("ate_rmse_all_cm",), lambda: absolute(every_frame)),
+        **_or_null(("rpe_trans_cm", "rpe_rot_deg"), relative),
     }
+
+
+def _or_null(keys: tuple[str, ...], compute: Callable[[], tuple[float, ...]]) -> Metrics:
+    try:
+        return dict(zip(keys, compute(), strict=True))
+    except EvaluationError as error:
+        _log.warning("%s: null, since %s", ", ".join(keys), error)
+        return dict.fromkeys(keys)
 
 
 def held_out_poses(reports: Sequence[FrameReport], every_frame: Trajectory, interval: int) -> list[tuple[int, Matrix4]]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from tgslam.config.schema import EvaluationConfig
 from tgslam.datasets.source import RgbdSource
-from tgslam.errors import OutputError
+from tgslam.errors import EvaluationError, OutputError
 from tgslam.evaluation.protocol import (
     IMAGE_KEYS,
     TRAJECTORY_KEYS,
@@ -68,7 +68,8 @@ def evaluate_run(
     """Every metric that the files of a run and its input give: the one way for both `run` and `eval`.
 
     make_render: makes the function that renders the map; None leaves the image metrics null, as no source does.
-    Raises OutputError when the run was cut off before it wrote its trajectory, or a file of it is damaged.
+    Raises OutputError when the run was cut off before it wrote its trajectory, or a file of it is damaged, and
+    EvaluationError when the input has changed since.
     """
     if not folder.trajectory.exists():
         raise OutputError(f"{folder.path}: this run did not come to its end: it has no {folder.trajectory.name}")
@@ -79,6 +80,10 @@ def evaluate_run(
     if groundtruth is not None:
         metrics |= trajectory_metrics(every_frame, keyframes, groundtruth, config)
     if source is not None and make_render is not None:
+        if len(reports) > len(source):
+            raise EvaluationError(
+                f"{source.name} has {len(source)} frames now, but this run saw {len(reports)}; restore its input"
+            )
         poses = held_out_poses(reports, every_frame, config.holdout_interval)
         metrics |= image_metrics(source, poses, gaussians, make_render(), stop_requested)
     return metrics
