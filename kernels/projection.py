@@ -5,7 +5,6 @@ Columns of a splat row (and of its gradient) are the constants below.
 """
 
 import taichi as ti
-
 from tgslam.kernels.simd import ALPHA_MIN, TILE
 
 nd = ti.types.ndarray
@@ -48,7 +47,7 @@ def rotation_of_pose(pose: ti.template()):
 
 @ti.func
 def clamped(ratio, centre, focal, size):
-    """x/z (or y/z) limited to EDGE half-images around the image, so that the linearisation stays sane beside the camera."""
+    """x/z (or y/z) limited to EDGE half-images, so that the linearisation stays sane beside the camera."""
     low = (-0.5 * (EDGE - 1.0) * size - centre) / focal
     high = ((1.0 + 0.5 * (EDGE - 1.0)) * size - centre) / focal
     return ti.min(ti.max(ratio, low), high)
@@ -61,6 +60,13 @@ def blurred_determinant(ax: ti.template(), ay: ti.template()):
     cxx cyy - cxy^2 cancels to nothing in float32 for a long thin splat across the pixel grid; this sums positive terms.
     """
     return ax.cross(ay).norm_sqr() + BLUR * (ax.norm_sqr() + ay.norm_sqr() + BLUR)
+
+
+@ti.func
+def precision_times_rows(ax: ti.template(), ay: ti.template(), inv_det):
+    """B = (A A^T + BLUR I)^-1 A, with the triple product since, for the reason above, B is small where A is large."""
+    n = ax.cross(ay)
+    return (ay.cross(n) + BLUR * ax) * inv_det, (n.cross(ax) + BLUR * ay) * inv_det
 
 
 @ti.kernel
@@ -104,13 +110,13 @@ def project(
             cxx, cxy, cyy = ax.dot(ax) + BLUR, ax.dot(ay), ay.dot(ay) + BLUR
             inv_det = 1.0 / blurred_determinant(ax, ay)
             qxx, qxy, qyy = cyy * inv_det, -cxy * inv_det, cxx * inv_det
-            szu, szv = mz.dot(ax), mz.dot(ay)
+            bx, by = precision_times_rows(ax, ay, inv_det)
             u, v = fx * x[0] * inv_z + camera[2], fy * x[1] * inv_z + camera[3]
             opacity = sigmoid(opacity_logit[i])
             splat[i, U], splat[i, V] = u, v
             splat[i, QA], splat[i, QB], splat[i, QC] = 0.5 * qxx, qxy, 0.5 * qyy
             splat[i, OPACITY], splat[i, Z] = opacity, x[2]
-            splat[i, ZU], splat[i, ZV] = szu * qxx + szv * qxy, szu * qxy + szv * qyy
+            splat[i, ZU], splat[i, ZV] = mz.dot(bx), mz.dot(by)
             for c in ti.static(range(3)):
                 splat[i, RED + c] = colour[i, c]
                 splat[i, EMBEDDING + c] = sigmoid(embedding[i, c])
@@ -177,21 +183,19 @@ def project_backward(
                 cxx, cxy, cyy = ax.dot(ax) + BLUR, ax.dot(ay), ay.dot(ay) + BLUR
                 inv_det = 1.0 / blurred_determinant(ax, ay)
                 qxx, qxy, qyy = cyy * inv_det, -cxy * inv_det, cxx * inv_det
-                szu, szv = mz.dot(ax), mz.dot(ay)
-                # Inverse covariance and depth slopes -> covariance and its products with the z row
+                # Inverse covariance Q and depth slopes B mz -> rows of A = J M and the z row of M. With B = Q A and the
+                # part of mz that the slopes leave, no term of a long splat is the small difference of large ones:
+                # dQ = -Q dA B^T - B dA^T Q, d(slope) = Q dA rest - B dA^T slope + B dmz
+                bx, by = precision_times_rows(ax, ay, inv_det)
+                zu, zv = mz.dot(bx), mz.dot(by)
+                rest = mz - zu * ax - zv * ay
                 gu, gv, gz = splat_grad[i, U], splat_grad[i, V], splat_grad[i, Z]
                 gzu, gzv = splat_grad[i, ZU], splat_grad[i, ZV]
-                gxx = 0.5 * splat_grad[i, QA] + gzu * szu
-                gyy = 0.5 * splat_grad[i, QC] + gzv * szv
-                gxy = 0.5 * (splat_grad[i, QB] + gzu * szv + gzv * szu)  # the symmetric matrix's off-diagonal
-                pxx, pxy = qxx * gxx + qxy * gxy, qxx * gxy + qxy * gyy
-                pyx, pyy = qxy * gxx + qyy * gxy, qxy * gxy + qyy * gyy
-                hxx, hyy = -(pxx * qxx + pxy * qxy), -(pyx * qxy + pyy * qyy)
-                hxy = -(pxx * qxy + pxy * qyy)
-                gsu, gsv = qxx * gzu + qxy * gzv, qxy * gzu + qyy * gzv
-                gax = 2.0 * (hxx * ax + hxy * ay) + gsu * mz
-                gay = 2.0 * (hxy * ax + hyy * ay) + gsv * mz
-                gmz = gsu * ax + gsv * ay
+                gxx, gxy, gyy = 0.5 * splat_grad[i, QA], 0.5 * splat_grad[i, QB], 0.5 * splat_grad[i, QC]
+                gbx, gby = gxx * bx + gxy * by, gxy * bx + gyy * by
+                gmz = gzu * bx + gzv * by
+                gax = (qxx * gzu + qxy * gzv) * rest - zu * gmz - 2.0 * (qxx * gbx + qxy * gby)
+                gay = (qxy * gzu + qyy * gzv) * rest - zv * gmz - 2.0 * (qxy * gbx + qyy * gby)
                 # Rows of A = J M -> J and M
                 m0 = ti.Vector([M[0, 0], M[0, 1], M[0, 2]])
                 m1 = ti.Vector([M[1, 0], M[1, 1], M[1, 2]])
@@ -225,11 +229,10 @@ def project_backward(
                 # M = R Rq S
                 H = R.transpose() @ ti.Matrix.rows([gm0, gm1, gm2])
                 for k in ti.static(range(3)):
-                    dot = 0.0
                     for r in ti.static(range(3)):
-                        dot += H[r, k] * Rq[r, k]
                         H[r, k] *= s[k]
-                    grad_log_scale[i, k] += dot * s[k]
+                    # A's column k times its own gradient, and mz's, with what cancels left out
+                    grad_log_scale[i, k] += 2.0 * (gmz[k] * rest[k] - gbx[k] * bx[k] - gby[k] * by[k])
                 w, a, b, c = q[0], q[1], q[2], q[3]
                 gq = 2.0 * ti.Vector(
                     [

@@ -124,7 +124,7 @@ def relative_error(actual: np.ndarray, expected: np.ndarray) -> float:
     return float(np.linalg.norm(actual - expected) / np.linalg.norm(expected))
 
 
-def assert_gradient_matches(actual: np.ndarray, expected: np.ndarray, name: str, rtol: float = 1e-3) -> None:
+def assert_gradient_matches(actual: np.ndarray, expected: np.ndarray, name: str, rtol: float = 2e-4) -> None:
     """Norm-wise, element by element where an element is not small, and nothing silently zero."""
     assert np.isfinite(actual).all(), name
     error = relative_error(actual, expected)
@@ -142,7 +142,7 @@ def check_gradients(
     T_cw: np.ndarray,
     camera: Camera,
     rows: list[int] | None = None,
-    rtol: float = 1e-3,
+    rtol: float = 2e-4,
     names: tuple[str, ...] = (*NAMES, "pose"),
 ) -> dict[str, np.ndarray]:
     """Every parameter group of `rows` (default all) against central differences; returns the kernels' gradients."""
@@ -160,7 +160,7 @@ def check_gradients(
     return actual
 
 
-def check_directions(gaussians: Gaussians, T_cw: np.ndarray, camera: Camera, rtol: float = 1e-3) -> None:
+def check_directions(gaussians: Gaussians, T_cw: np.ndarray, camera: Camera, rtol: float = 2e-4) -> None:
     """Directional derivatives of each whole group, for scenes where element by element would take minutes.
 
     The direction is the sign pattern of the kernel's own gradient: nothing cancels, and the error is that of sum |g|.
@@ -373,17 +373,38 @@ def test_a_gaussian_larger_than_the_image() -> None:
     check_gradients(gaussians, np.eye(4), CAMERA)
 
 
-@pytest.mark.parametrize("length_m", [0.1, 1.0, 10.0])
+@pytest.mark.parametrize("length_m", [0.1, 1.0, 3.0, 10.0])
 def test_needles(length_m: float) -> None:
-    """Thinner than a pixel, and up to 200 px long and across the pixel grid."""
+    """Thinner than a pixel, and up to 200 px long and across the pixel grid: where float32 covariances cancel."""
     rng = np.random.default_rng(14)
-    needles = random_gaussians(25, CAMERA, seed=14, tangent=0.8)
-    log_scale = np.log(np.column_stack([np.full(25, length_m), np.full(25, 2e-3), rng.uniform(1e-4, 1e-2, 25)]))
+    needles = random_gaussians(20, CAMERA, seed=14, tangent=0.8)
+    log_scale = np.log(np.column_stack([np.full(20, length_m), np.full(20, 2e-3), rng.uniform(1e-4, 1e-2, 20)]))
     gaussians = make_gaussians(**{**{n: getattr(needles, n) for n in NAMES}, "log_scale": log_scale})
     # The depth of a 10 m needle that points at the camera changes by metres over a few pixels
-    assert_images_match(gaussians, POSE, CAMERA, atol=3e-3 if length_m > 1.0 else ATOL)
-    if length_m <= 1.0:
-        check_directions(gaussians, POSE, CAMERA)
+    assert_images_match(gaussians, POSE, CAMERA, atol=1e-3 if length_m > 3.0 else ATOL)
+    check_gradients(gaussians, POSE, CAMERA)
+
+
+def test_large_flat_splats_seen_edge_on() -> None:
+    """A wall's splats from the side: needles on the screen with two long axes that project onto the same line."""
+    camera = Camera(50, 37, 300.0, 300.0, 24.3, 18.9)
+    rng = np.random.default_rng(26)
+    n = 12
+    tilt = np.deg2rad(rng.uniform(84.0, 90.0, n))  # from facing the camera
+    roll = rng.uniform(0.0, np.pi, n)
+    half = np.column_stack(
+        [np.cos(tilt / 2), np.sin(tilt / 2) * np.cos(roll), np.sin(tilt / 2) * np.sin(roll), 0 * roll]
+    )
+    gaussians = make_gaussians(
+        mean=np.column_stack([rng.uniform(-0.06, 0.06, n), rng.uniform(-0.04, 0.04, n), rng.uniform(0.8, 1.2, n)]),
+        log_scale=np.log(np.tile([0.2, 0.15, 1e-3], (n, 1))),
+        quat_wxyz=half,
+        opacity_logit=rng.uniform(-1.0, 1.0, n),
+        colour=rng.uniform(size=(n, 3)),
+        embedding=rng.normal(size=(n, 3)),
+    )
+    assert_images_match(gaussians, np.eye(4), camera)
+    check_gradients(gaussians, np.eye(4), camera)
 
 
 def test_opacities_near_zero_and_one() -> None:
