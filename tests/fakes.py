@@ -47,14 +47,21 @@ class FakeSource:
 class FakeSystem:
     """Knows the true poses, makes every third frame a keyframe, and holds one Gaussian a keyframe."""
 
-    def __init__(self, lost: tuple[int, ...] = (), on_frame: Callable[[int], None] = lambda index: None) -> None:
+    def __init__(
+        self,
+        lost: tuple[int, ...] = (),
+        refused: tuple[int, ...] = (),
+        on_frame: Callable[[int], None] = lambda index: None,
+    ) -> None:
         self.frames: list[Frame] = []
         self.keyframes: list[Frame] = []
         self.finished = False
-        self.lost, self.on_frame = lost, on_frame
+        self.lost, self.refused, self.on_frame = lost, refused, on_frame
 
     def process_frame(self, frame: Frame) -> FrameReport:
         self.on_frame(frame.index)
+        if frame.index in self.refused:
+            raise FrameError(f"frame {frame.index} has no depth")
         is_keyframe = frame.index % 3 == 0
         self.frames.append(frame)
         if is_keyframe:

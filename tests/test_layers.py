@@ -16,7 +16,7 @@ RANKS = (
     {"errors", "geometry", "types"},
     {"kernels", "configs", "config"},
     {"runtime"},
-    {"arrays", "gaussian_map", "images", "losses", "optim", "plane_fit", "render"},  # op wrappers
+    {"arrays", "gaussian_map", "images", "losses", "optim", "plane_fit", "render", "vector_adam"},  # op wrappers
     {"closures", "keyframes", "mapping", "planes", "pose_graph", "synthetic", "tracking"},
     {"datasets", "slam"},
     {"evaluation", "output"},

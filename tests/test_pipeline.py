@@ -85,11 +85,13 @@ def test_the_log_of_a_killed_run_is_read_up_to_its_last_whole_line(tmp_path: Pat
 
 
 def test_bad_frames_are_skipped_and_counted(folder: RunFolder) -> None:
-    summary = pipeline.run(FakeSource(12, bad=(1, 5)), FakeSystem(lost=(4,)), folder)
+    summary = pipeline.run(FakeSource(12, bad=(1, 5)), FakeSystem(lost=(4,), refused=(8,)), folder)
     statuses = [report.status for report in summary.reports]
-    assert statuses.count(FrameStatus.SKIPPED) == 2
+    assert [index for index, status in enumerate(statuses) if status is FrameStatus.SKIPPED] == [1, 5, 8]
     assert statuses.count(FrameStatus.LOST) == 1
-    assert len(read_trajectory(folder.trajectory)) == 10
+    assert summary.reports[8].message == "frame 8 has no depth"
+    assert summary.reports[8].timestamp_s == pytest.approx(0.8)
+    assert len(read_trajectory(folder.trajectory)) == 9
 
 
 @pytest.mark.parametrize(("bad", "lost"), [(tuple(range(6)), ()), ((), tuple(range(1, 6))), ((), tuple(range(6)))])

@@ -28,7 +28,7 @@ class System(Protocol):
     """What a run needs of the SLAM system."""
 
     def process_frame(self, frame: Frame) -> FrameReport:
-        """Take the next frame of the sequence."""
+        """Take the next frame of the sequence. Raises FrameError, unchanged, for one that it cannot use."""
 
     def finish(self) -> None:
         """Refine the map once all frames are in."""
@@ -127,22 +127,29 @@ def _frame_loop(
             if stop_requested():
                 interrupted = True
                 break
-            gaussians = reports[-1].gaussians if reports else 0
-            report = _skipped(position, item, gaussians) if isinstance(item, FrameError) else system.process_frame(item)
-            reports.append(report)
-            log.append(report)
-            observer(report)
+            reports.append(_report(position, item, system, gaussians=reports[-1].gaussians if reports else 0))
+            log.append(reports[-1])
+            observer(reports[-1])
             _warn(reports)
             waiting_since_s = time.perf_counter()
     loop_s = time.perf_counter() - start_s
     return Summary(reports, loop_s=loop_s, finish_s=0.0, read_s=read_s, interrupted=interrupted)
 
 
-def _skipped(position: int, error: FrameError, gaussians: int) -> FrameReport:
-    """The report of a frame that never reached the system; its time is not known, its index is its position."""
+def _report(position: int, item: Frame | FrameError, system: System, gaussians: int) -> FrameReport:
+    """What became of one frame. One that could not be read has no time, and its position in the source as its index."""
+    if isinstance(item, FrameError):
+        return _skipped(position, math.nan, item, gaussians)
+    try:
+        return system.process_frame(item)
+    except FrameError as error:
+        return _skipped(item.index, item.timestamp_s, error, gaussians)
+
+
+def _skipped(index: int, timestamp_s: float, error: FrameError, gaussians: int) -> FrameReport:
     return FrameReport(
-        index=position,
-        timestamp_s=math.nan,
+        index=index,
+        timestamp_s=timestamp_s,
         status=FrameStatus.SKIPPED,
         is_keyframe=False,
         gaussians=gaussians,
