@@ -20,10 +20,10 @@ def count_steps(
 
 @ti.func
 def update(g, m_old, v_old, gain1, gain2, epsilon, correct_m, correct_v):
-    """New moments and the change of the parameter for a learning rate of 1."""
+    """New moments, and what to subtract from the parameter for a learning rate of 1."""
     m = m_old + gain1 * (g - m_old)
     v = v_old + gain2 * (g * g - v_old)
-    return m, v, -m * correct_m / (ti.sqrt(v * correct_v) + epsilon)
+    return m, v, m * correct_m / (ti.sqrt(v * correct_v) + epsilon)
 
 
 @ti.kernel
@@ -40,19 +40,23 @@ def adam_rows(
     parameter: F2,  # [N, C] in and out
     m: F2,  # [N, C] first moment, in and out
     v: F2,  # [N, C] second moment, in and out
+    channels: ti.template(),  # C: known to the compiler, the row is loaded and stored at once
 ):
     """Adam with a bias correction of its own for each row; rows that are not visible keep value and moments."""
     for i in range(rows):
         if visible[i] != 0:
             t = ti.min(steps[i], correction.shape[0] - 1)
             correct_m, correct_v = correction[t, 0], correction[t, 1]
-            for c in range(parameter.shape[1]):
-                m_new, v_new, change = update(
-                    gradient[i, c], m[i, c], v[i, c], gain1, gain2, epsilon, correct_m, correct_v
-                )
-                m[i, c] = m_new
-                v[i, c] = v_new
-                parameter[i, c] = parameter[i, c] + rate * change
+            g = ti.Vector([gradient[i, c] for c in ti.static(range(channels))])
+            m_old = ti.Vector([m[i, c] for c in ti.static(range(channels))])
+            v_old = ti.Vector([v[i, c] for c in ti.static(range(channels))])
+            value = ti.Vector([parameter[i, c] for c in ti.static(range(channels))])
+            m_new, v_new, change = update(g, m_old, v_old, gain1, gain2, epsilon, correct_m, correct_v)
+            value = value - rate * change
+            for c in ti.static(range(channels)):
+                m[i, c] = m_new[c]
+                v[i, c] = v_new[c]
+                parameter[i, c] = value[c]
 
 
 @ti.kernel
@@ -79,4 +83,4 @@ def adam_scalars(
             )
             m[i] = m_new
             v[i] = v_new
-            parameter[i] = parameter[i] + rate * change
+            parameter[i] = parameter[i] - rate * change

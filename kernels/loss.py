@@ -366,20 +366,24 @@ def colour_gradient(
         i, begin, end = segment(s, by_luma.shape[1])
         total, by_gain, by_bias = 0.0, 0.0, 0.0
         for b in range(begin, end):
-            luma = by_luma[i, b]
+            luma, m = by_luma[i, b], Lanes(0.0)
             for k in ti.static(range(LANES)):
-                if b * LANES + k < width:
-                    j = b * LANES + k
-                    m = ti.select(opacity[i, j] >= min_opacity, mask[i, j], 0.0)
-                    for c in ti.static(range(3)):
-                        value = colour[i, j, c]
-                        r = gain * value + bias - colour_gt[i, j, c]
-                        root = ti.sqrt(r * r + epsilon * epsilon)
-                        g = m * (scale * r / root + LUMA[c] * luma[k])
-                        total += m * (root - epsilon)
-                        by_gain += g * value
-                        by_bias += g
-                        g_colour[i, j, c] = gain * g
+                j = ti.min(b * LANES + k, width - 1)
+                m[k] = ti.select((b * LANES + k < width) and (opacity[i, j] >= min_opacity), mask[i, j], 0.0)
+            for c in ti.static(range(3)):
+                value, r = Lanes(0.0), Lanes(0.0)
+                for k in ti.static(range(LANES)):
+                    j = ti.min(b * LANES + k, width - 1)
+                    value[k] = colour[i, j, c]
+                    r[k] = gain * value[k] + bias - colour_gt[i, j, c]
+                root = ti.sqrt(r * r + epsilon * epsilon)
+                g = m * (scale * r / root + LUMA[c] * luma)
+                total += (m * (root - epsilon)).sum()
+                by_gain += (g * value).sum()
+                by_bias += g.sum()
+                for k in ti.static(range(LANES)):
+                    if b * LANES + k < width:
+                        g_colour[i, b * LANES + k, c] = gain * g[k]
         sums[s, 0] = total
         sums[s, 1] = by_gain
         sums[s, 2] = by_bias

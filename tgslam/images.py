@@ -93,11 +93,12 @@ def normals(
     """Unit surface normals from float32 [H, W] depth in m -> [H, W, 3], camera frame, towards the camera.
 
     Inverse depth of a plane is affine in the pixel, and the noise of a structured-light sensor, sigma_z =
-    sigma_per_m2 z^2, is constant in inverse depth: a least-squares fit of inverse depth is the best one. There is a fit
-    for each 2x2 block (an odd last row or column joins the block before), over (2 radius + 1)^2 blocks (radius 3: 14x14 pixels), from those on the same surface: within
-    4 sigma plus what a plane at `steepest_rad` to the optical axis would rise to. (0, 0, 0) where there is no depth,
-    where fewer than 30 % of the window are left, where the fit's residual exceeds 2 sigma plus 0.3 % (an edge runs
-    through it), and at pixels more than 4 sigma plus 1 % off the fit (the far side of an edge).
+    sigma_per_m2 z^2, is constant in inverse depth: a least-squares fit of inverse depth is the best one. There is a
+    fit for each 2x2 block (an odd last row or column joins the block before), over (2 radius + 1)^2 blocks (radius 3:
+    14x14 pixels), from those on the same surface: within 4 sigma plus what a plane at `steepest_rad` to the optical
+    axis would rise to. (0, 0, 0) where there is no depth, where fewer than 30 % of the window are left, where the
+    fit's residual exceeds 2 sigma and 0.3 % (their root sum of squares: an edge runs through it), and at pixels more
+    than 4 sigma plus 1 % off the fit (the far side of an edge).
     """
     require("depth_m", depth_m, (camera.height, camera.width))
     height, width = depth_m.shape

@@ -77,11 +77,14 @@ class Adam:
         require("visible", visible, (self._rows,), np.int32, at_least=True)
         kernels.count_steps(self._rows, visible, self._steps)
         for group, parameter in parameters.items():
-            update = kernels.adam_rows if self._channels[group] else kernels.adam_scalars
-            update(
+            arguments = (
                 self._rows, self.learning_rates[group], *self._gains, self._epsilon, self._correction, self._steps,
                 visible, gradients[group], parameter, self._m[group], self._v[group],
             )  # fmt: skip
+            if self._channels[group]:
+                kernels.adam_rows(*arguments, self._channels[group])
+            else:
+                kernels.adam_scalars(*arguments)
 
     def append(self, rows: int) -> None:
         """Add rows with no history at the end."""
