@@ -5,22 +5,34 @@ import taichi as ti
 PLAIN, CLOUD, TILES, PLANKS, BOOKS, PICTURE, WEAVE = range(7)  # material kinds
 
 _OCTAVES = 4
+_STEP_I, _STEP_J = 1640531513, 1013904223  # what a lattice step adds to the word that is hashed
 _JOINT = 0.035  # share of a tile or plank that is joint
 _PICTURE_BORDER_M = 0.035
 
 
 @ti.func
-def lattice_hash(i: ti.i32, j: ti.i32, seed: ti.i32) -> ti.f32:
-    """A number in [0, 1) for an integer lattice point."""
-    h = (
-        ti.cast(i, ti.u32) * ti.cast(1640531513, ti.u32)
-        + ti.cast(j, ti.u32) * ti.cast(1013904223, ti.u32)
+def _lattice_word(i: ti.i32, j: ti.i32, seed: ti.i32) -> ti.u32:
+    return (
+        ti.cast(i, ti.u32) * ti.cast(_STEP_I, ti.u32)
+        + ti.cast(j, ti.u32) * ti.cast(_STEP_J, ti.u32)
         + ti.cast(seed, ti.u32) * ti.cast(1597334677, ti.u32)
     )
+
+
+@ti.func
+def _mixed(word: ti.u32) -> ti.f32:
+    """A number in [0, 1) that looks random, from a word that does not."""
+    h = word
     h = (h ^ (h >> ti.cast(16, ti.u32))) * ti.cast(2057459429, ti.u32)
     h = (h ^ (h >> ti.cast(13, ti.u32))) * ti.cast(1274126177, ti.u32)
     h = h ^ (h >> ti.cast(16, ti.u32))
     return ti.cast(h >> ti.cast(8, ti.u32), ti.f32) * (1.0 / 16777216.0)
+
+
+@ti.func
+def lattice_hash(i: ti.i32, j: ti.i32, seed: ti.i32) -> ti.f32:
+    """A number in [0, 1) for an integer lattice point."""
+    return _mixed(_lattice_word(i, j, seed))
 
 
 @ti.func
@@ -30,8 +42,11 @@ def _clamp01(x: ti.f32) -> ti.f32:
 
 @ti.func
 def _corners(i: ti.i32, j: ti.i32, ws: ti.f32, wt: ti.f32, seed: ti.i32) -> ti.f32:
-    low = lattice_hash(i, j, seed) * (1.0 - ws) + lattice_hash(i + 1, j, seed) * ws
-    high = lattice_hash(i, j + 1, seed) * (1.0 - ws) + lattice_hash(i + 1, j + 1, seed) * ws
+    word = _lattice_word(i, j, seed)
+    step_i = ti.cast(_STEP_I, ti.u32)
+    above = word + ti.cast(_STEP_J, ti.u32)
+    low = _mixed(word) * (1.0 - ws) + _mixed(word + step_i) * ws
+    high = _mixed(above) * (1.0 - ws) + _mixed(above + step_i) * ws
     return low * (1.0 - wt) + high * wt
 
 

@@ -17,6 +17,8 @@ LAYER_LEAD = 3e-4  # relative depth by which a layer wins over the one below
 _TINY = 1e-9
 _MIN_COSINE = 0.03  # bounds the footprint at grazing angles
 _EDGE_SHADE_M = 0.2  # reach of the darkening towards corners
+_OCCLUSION_M = 0.09  # how far in front of a surface its occlusion is looked up
+_OCCLUSION = 0.9  # darkening where everything around is solid
 _SKY = (0.55, 0.62, 0.7)
 
 Ints2 = ti.types.ndarray(dtype=ti.i32, ndim=2)
@@ -282,12 +284,36 @@ def _surface_coordinates(
 
 
 @ti.func
+def _occlusion(grid: ti.template(), light: ti.template(), point: ti.math.vec3) -> ti.f32:
+    """The occlusion grid [Z, Y, X] at a camera-frame point, trilinear; rows 3 to 5 of `light` map it to grid units."""
+    low = ti.Vector([0, 0, 0])
+    share = ti.math.vec3(0.0)
+    for k in ti.static(range(3)):
+        x = light[3 + k, 0] * point[0] + light[3 + k, 1] * point[1] + light[3 + k, 2] * point[2] + light[3 + k, 3]
+        x = ti.min(ti.max(x, 0.0), grid.shape[2 - k] - 1.001)
+        low[k] = ti.cast(ti.floor(x), ti.i32)
+        share[k] = x - ti.floor(x)
+    total = 0.0
+    for dz, dy, dx in ti.static(ti.ndrange(2, 2, 2)):
+        weight = ti.abs(1 - dx - share[0]) * ti.abs(1 - dy - share[1]) * ti.abs(1 - dz - share[2])
+        total += weight * grid[low[2] + dz, low[1] + dy, low[0] + dx]
+    return total
+
+
+@ti.func
 def _lit(
-    albedo: ti.math.vec3, point: ti.math.vec3, n: ti.math.vec3, light: ti.template(), edge_m: ti.f32, edge_shade: ti.f32
+    albedo: ti.math.vec3,
+    point: ti.math.vec3,
+    n: ti.math.vec3,
+    light: ti.template(),
+    occlusion: ti.template(),
+    edge_m: ti.f32,
+    edge_shade: ti.f32,
 ) -> ti.math.vec3:
     """Ambient light from above, a distant fill and a lamp, all Lambertian, darker towards a flat surface's edges.
 
-    light [3, 4] in the camera frame: (up, ambient), (direction to the fill, its strength), (lamp m, its strength).
+    light [6, 4], camera frame: (up, ambient), (direction to the fill, its strength), (lamp m, its strength), and the
+    three rows that take a point to the units of the occlusion grid.
     """
     to_lamp = ti.math.vec3(light[2, 0], light[2, 1], light[2, 2]) - point
     distance = ti.max(to_lamp.norm(), 0.05)
@@ -295,6 +321,7 @@ def _lit(
     fill = n[0] * light[1, 0] + n[1] * light[1, 1] + n[2] * light[1, 2]
     lamp = ti.max(n.dot(to_lamp) / distance, 0.0) / (1.0 + 0.08 * distance * distance)
     level = light[0, 3] * (1.0 + 0.15 * up) + light[1, 3] * (0.5 + 0.5 * fill) + light[2, 3] * lamp
+    level *= 1.0 - _OCCLUSION * _occlusion(occlusion, light, point + _OCCLUSION_M * n)
     return albedo * level * (1.0 - edge_shade * ti.exp(-edge_m / _EDGE_SHADE_M))
 
 
@@ -312,6 +339,7 @@ def _shade_hit(
     material_kind: ti.template(),
     material: ti.template(),
     light: ti.template(),
+    occlusion: ti.template(),
 ) -> ti.math.vec3:
     """Colour [3] of primitive i where the ray meets it."""
     shape = meta[i, 0]
@@ -344,13 +372,15 @@ def _shade_hit(
     n_camera = ti.math.vec3(0.0)
     for k in ti.static(range(3)):
         n_camera[k] = axes[i, 0, k] * n[0] + axes[i, 1, k] * n[1] + axes[i, 2, k] * n[2]
-    return _lit(albedo, t * ray, n_camera, light, ti.max(edge_m, 0.0), ti.select(axis >= 0, material[m, 9], 0.0))
+    return _lit(
+        albedo, t * ray, n_camera, light, occlusion, ti.max(edge_m, 0.0), ti.select(axis >= 0, material[m, 9], 0.0)
+    )
 
 
 @ti.func
 def _is_edge(primitive: ti.template(), label: ti.template(), row: ti.i32, column: ti.i32) -> bool:
     edge = False
-    for dr, dc in ti.static(ti.ndrange((-1, 2), (-1, 2))):
+    for dr, dc in ti.static(((-1, 0), (0, -1), (0, 1), (1, 0))):
         r = ti.min(ti.max(row + dr, 0), primitive.shape[0] - 1)
         c = ti.min(ti.max(column + dc, 0), primitive.shape[1] - 1)
         if primitive[r, c] != primitive[row, column] or label[r, c] != label[row, column]:
@@ -366,7 +396,8 @@ def shade(
     half_m: Floats2,  # [N, 3] m
     material_kind: Ints2,  # [M, 2] kind, seed
     material: Floats2,  # [M, 10] colour a, colour b, scale s m, scale t m, contrast, edge shade
-    light: Floats2,  # [3, 4] see _lit, camera
+    light: Floats2,  # [6, 4] see _lit, camera
+    occlusion: Floats3,  # [Z, Y, X] share of the neighbourhood that is solid
     near_m: Floats1,  # [N] m, lower bound of the primitive's depth, ascending
     counts: Ints1,  # [tiles]
     lists: Ints2,  # [tiles, N]
@@ -402,7 +433,9 @@ def shade(
                 t, i = _first_hit(tile, ray, meta, axes, origin, half_m, near_m, counts, lists)
             sample = ti.math.vec3(_SKY[0], _SKY[1], _SKY[2])
             if i >= 0:
-                sample = _shade_hit(i, t, ray, fx, fy, meta, axes, origin, half_m, material_kind, material, light)
+                sample = _shade_hit(
+                    i, t, ray, fx, fy, meta, axes, origin, half_m, material_kind, material, light, occlusion
+                )
             total += ti.min(ti.max(sample, 0.0), 1.0)
         for channel in ti.static(range(3)):
             colour[row, column, channel] = total[channel] / samples

@@ -40,7 +40,8 @@ def points_c(camera: Camera, depth_m: np.ndarray) -> np.ndarray:
 
 def assert_twins_agree(raycaster: Raycaster, scene, camera: Camera, T_wc: np.ndarray) -> None:
     colour, view = raycaster.render(T_wc)
-    twin = reference.render(camera_scene(scene, camera, T_wc), scene.material_kind, scene.material, camera)
+    seen = camera_scene(scene, camera, T_wc)
+    twin = reference.render(seen, scene.material_kind, scene.material, scene.occlusion.share, camera)
     same = (twin.primitive == view.primitive) & (twin.label == view.label)
     assert same.mean() > 0.999
     assert np.abs(twin.depth_m - view.depth_m)[same].max() < 1e-4

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 from tgslam.kernels import procedural as kinds
 from tgslam.kernels.raycast import BOX, CYLINDER, ELLIPSOID, LAYER_LEAD, QUAD
 
@@ -20,8 +21,8 @@ class Hit:
     colour: np.ndarray  # [..., 3]
 
 
-def cast(scene, material_kind, material, rays, fx, fy):
-    """What the rays [..., 3] (x, y, 1) meet. scene: CameraScene; material_kind [M, 2], material [M, 10]."""
+def cast(scene, material_kind, material, occlusion, rays, fx, fy):
+    """What the rays [..., 3] (x, y, 1) meet. scene: CameraScene; the arrays as in kernels.raycast.shade."""
     shape = rays.shape[:-1]
     rays = rays.reshape(-1, 3)
     best_key = np.full(len(rays), NO_HIT)
@@ -38,7 +39,9 @@ def cast(scene, material_kind, material, rays, fx, fy):
         surface = Surface(scene, i, depth[mask], rays[mask], fx, fy)
         label[mask], cosine[mask] = surface.label(), surface.cosine()
         row = scene.meta[i, 1]
-        colour[mask] = np.clip(surface.lit(material_kind[row], material[row].astype(float), scene.light), 0, 1)
+        colour[mask] = np.clip(
+            surface.lit(material_kind[row], material[row].astype(float), scene.light, occlusion), 0, 1
+        )
     return Hit(*(a.reshape(*shape, *a.shape[1:]) for a in (depth, primitive, label, cosine, colour)))
 
 
@@ -138,7 +141,7 @@ class Surface:
             width = spread[:, :2] + spread[:, 2:]
         return st, half, width, np.maximum((half - np.abs(st)).min(1), 0)
 
-    def lit(self, kind_seed, material, light):
+    def lit(self, kind_seed, material, light, occlusion):
         st, half, width, edge = self.coordinates()
         albedo = surface_colour(*kind_seed, material, st, half, width)
         n = self.n @ self.axes
@@ -147,6 +150,9 @@ class Surface:
         lamp = np.maximum((n * to_lamp).sum(1) / distance, 0) / (1 + 0.08 * distance**2)
         level = light[0, 3] * (1 + 0.15 * n @ light[0, :3]) + light[1, 3] * (0.5 + 0.5 * n @ light[1, :3])
         level = level + light[2, 3] * lamp
+        ahead = self.t[:, None] * self.rays + 0.09 * n
+        grid = (light[3:, :3] @ ahead.T + light[3:, 3:])[::-1]
+        level = level * (1 - 0.9 * map_coordinates(occlusion.astype(float), grid, order=1, mode="nearest"))
         shade = np.where(self.axis >= 0, material[9], 0.0)
         return albedo * (level * (1 - shade * np.exp(-edge / 0.2)))[:, None]
 
@@ -272,17 +278,18 @@ def surface_colour(kind, seed, material, st, half, width):
     return mix(a, b, np.clip(0.5 + contrast * (0.5 * stripes + 0.8 * grain), 0, 1))
 
 
-def render(scene, material_kind, material, camera):
+def render(scene, material_kind, material, occlusion, camera):
     """Twin of `cast` then `shade`: the Hit of the pixel centres, with colour the mean of 2 x 2 rays along edges."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
 
     def at(du, dv):
         rays = np.stack([(u + du - camera.cx) / camera.fx, (v + dv - camera.cy) / camera.fy, np.ones(u.shape)], -1)
-        return cast(scene, material_kind, material, rays, camera.fx, camera.fy)
+        return cast(scene, material_kind, material, occlusion, rays, camera.fx, camera.fy)
 
     centre = at(0, 0)
     surface = np.pad(np.stack([centre.primitive, centre.label]), ((0, 0), (1, 1), (1, 1)), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(surface, (3, 3), axis=(1, 2))
-    edge = (windows != windows[..., 1:2, 1:2]).any(axis=(0, 3, 4))
+    cross = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], bool)
+    edge = ((windows != windows[..., 1:2, 1:2]) & cross).any(axis=(0, 3, 4))
     fine = np.mean([at(du, dv).colour for du in (-0.25, 0.25) for dv in (-0.25, 0.25)], axis=0)
     return replace(centre, colour=np.where(edge[..., None], fine, centre.colour))

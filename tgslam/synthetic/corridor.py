@@ -36,7 +36,7 @@ def corridor(length_m: float) -> Scene:
         _furnish(builder, f.wall(builder, _xy(backward[0]), _xy(backward[1]), HEIGHT_M, f.WHITE_WALL), backward, leg, 1)
     f.wall(builder, _xy(right[0]), _xy(left[0]), HEIGHT_M, f.PLASTER)
     f.wall(builder, _xy(left[-1]), _xy(right[-1]), HEIGHT_M, f.PLASTER)
-    return builder.build()
+    return builder.build(occlusion=False)
 
 
 def _xy(point: Vector) -> tuple[float, float]:

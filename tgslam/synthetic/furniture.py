@@ -40,7 +40,7 @@ WHITE_PANEL = replace(WHITE_LACQUER, colour=(0.77, 0.77, 0.75), seed=33)
 
 def picture(colour: Rgb, seed: int, grain_m: float = 0.11) -> Material:
     """An abstract picture of that mean colour in a white mount."""
-    return Material(PICTURE, colour, (0.93, 0.92, 0.88), grain_m, grain_m, 0.75, seed)
+    return Material(PICTURE, colour, (0.93, 0.92, 0.88), grain_m, grain_m, 0.5, seed)
 
 
 def raised(point_w: Vector, height_m: float) -> Vector:

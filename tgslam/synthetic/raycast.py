@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tgslam import runtime
 from tgslam.geometry import inverse
 from tgslam.kernels import raycast as kernels
+from tgslam.synthetic.occlusion import VOXEL_M
 from tgslam.synthetic.scene import Scene
 from tgslam.types import Camera, FloatImage, Matrix4
 
@@ -23,7 +24,7 @@ class CameraScene:
     origin: NDArray[np.float64]  # [N, 3] m
     half_m: NDArray[np.float64]  # [N, 3] m
     near_m: NDArray[np.float64]  # [N] m, lower bound of depth, ascending
-    light: NDArray[np.float64]  # [3, 4]
+    light: NDArray[np.float64]  # [6, 4], see kernels.raycast.shade
 
 
 @dataclass(frozen=True)
@@ -52,11 +53,13 @@ def camera_scene(scene: Scene, camera: Camera, T_wc: Matrix4) -> CameraScene:
     axes = scene.axes_w[order] @ R_cw.T
     lighting = scene.lighting
     fill = np.asarray(lighting.fill_direction_w)
+    to_grid = np.column_stack([T_wc[:3, :3], T_wc[:3, 3] - scene.occlusion.low_w]) / VOXEL_M
     light = np.array(
         [
             (*R_cw[:, 2], lighting.ambient),
             (*(R_cw @ fill / np.linalg.norm(fill)), lighting.fill),
             (*(R_cw @ lighting.lamp_position_w + t_cw), lighting.lamp),
+            *to_grid,
         ]
     )
     return CameraScene(
@@ -76,6 +79,7 @@ class Raycaster:
         self._scene, self._camera = scene, camera
         self._material_kind = runtime.to_device(scene.material_kind, np.int32)
         self._material = runtime.to_device(scene.material)
+        self._occlusion = runtime.to_device(scene.occlusion.share)
 
     def render(self, T_wc: Matrix4) -> tuple[FloatImage, View]:
         """Colour [H, W, 3] float32 in [0, 1] and geometry of the view from T_wc [4, 4] (camera to world)."""
@@ -104,6 +108,7 @@ class Raycaster:
             self._material_kind,
             self._material,
             runtime.to_device(local.light),
+            self._occlusion,
             near_m,
             counts,
             lists,

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tgslam.kernels.raycast import BOX, CYLINDER, ELLIPSOID, QUAD
+from tgslam.synthetic.occlusion import OcclusionGrid, bake, unoccluded
 
 Vector = NDArray[np.float64]
 Rgb = tuple[float, float, float]
@@ -52,6 +53,7 @@ class Scene:
     material: NDArray[np.float32]  # [M, 10] see kernels.raycast.shade
     planes_w: Vector  # [P, 4] unit normal out of the solid, offset in m: n . x + d = 0
     lighting: Lighting
+    occlusion: OcclusionGrid
 
     def __len__(self) -> int:
         return len(self.meta)
@@ -125,17 +127,18 @@ class SceneBuilder:
         self._add(CYLINDER, material, first, 0, axes, bottom + height / 2 * axes[2], half)
         return first
 
-    def build(self) -> Scene:
-        """The scene of everything added so far."""
+    def build(self, occlusion: bool = True) -> Scene:
+        """The scene of everything added so far. occlusion: bake it, which takes memory by the scene's volume."""
         metas, axes, centres, halves = zip(*self._rows, strict=True)
-        half_m = np.array(halves)
-        shapes = np.array(metas, np.int32)
+        meta, half_m = np.array(metas, np.int32), np.array(halves)
+        radius_m = np.where(meta[:, 0] == ELLIPSOID, half_m.max(axis=1), np.linalg.norm(half_m, axis=1))
+        solids = (meta[:, 0], np.array(axes), np.array(centres), half_m, radius_m)
         return Scene(
-            meta=shapes,
-            axes_w=np.array(axes),
-            centre_w=np.array(centres),
+            meta=meta,
+            axes_w=solids[1],
+            centre_w=solids[2],
             half_m=half_m,
-            radius_m=np.where(shapes[:, 0] == ELLIPSOID, half_m.max(axis=1), np.linalg.norm(half_m, axis=1)),
+            radius_m=radius_m,
             material_kind=np.array([(m.kind, m.seed) for m in self._materials], np.int32),
             material=np.array(
                 [(*m.colour, *m.second, m.scale_s_m, m.scale_t_m, m.contrast, m.edge_shade) for m in self._materials],
@@ -143,6 +146,7 @@ class SceneBuilder:
             ),
             planes_w=np.array(self._planes).reshape(-1, 4),
             lighting=self.lighting,
+            occlusion=bake(*solids) if occlusion else unoccluded(),
         )
 
     def _plane(self, normal: Vector, point: Vector) -> int:
