@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam import runtime
 from tgslam.config.schema import Config
+from tgslam.depth import without_flying_pixels
 from tgslam.errors import FrameError
 from tgslam.geometry import inverse, orthonormalized
 from tgslam.keyframes import KeyframeSelector
@@ -38,7 +40,7 @@ class Slam:
     """RGB-D frames in; poses and a Gaussian map out. The first frame's camera is the world frame."""
 
     def __init__(self, camera: Camera, config: Config) -> None:
-        self.camera = camera
+        self.camera, self.sigma_per_m2 = camera, config.loss.depth_sigma_per_m2
         self.tracker = make_tracker(camera, config.tracking, config.loss)
         self.motion = ConstantVelocity()
         self.selector = KeyframeSelector(config.keyframes)
@@ -53,8 +55,9 @@ class Slam:
 
         Raises FrameError, with nothing changed, for a frame with next to no depth or of another size than the camera's.
         """
-        self._check(frame)
         self._stage_s = {}
+        with self._stage("prepare"):
+            frame = self._prepared(frame)
         if not self.mapper.keyframes:
             first = TrackingResult(np.eye(4), Exposure(), np.eye(6), lost=False)
             self._map(frame, first)
@@ -124,12 +127,16 @@ class Slam:
         else:
             self.exposure = result.exposure
 
-    def _check(self, frame: Frame) -> None:
+    def _prepared(self, frame: Frame) -> Frame:
+        """The frame without flying pixels. Raises FrameError for a frame that cannot be used."""
         size = (self.camera.height, self.camera.width)
         if frame.depth_m.shape != size or frame.colour.shape != (*size, 3):
             raise FrameError(f"frame {frame.index}: images of {frame.depth_m.shape} do not fit the camera's {size}")
+        depth_m = without_flying_pixels(runtime.to_device(frame.depth_m), self.sigma_per_m2, self.camera.fx)
+        frame = replace(frame, depth_m=runtime.to_host(depth_m))
         if (frame.depth_m > 0).mean() < _MIN_DEPTH_SHARE:
             raise FrameError(f"frame {frame.index}: depth in less than {_MIN_DEPTH_SHARE:.0%} of its pixels")
+        return frame
 
     @contextmanager
     def _stage(self, name: str) -> Iterator[None]:

@@ -106,7 +106,7 @@ class SeedingConfig:
     planar_sigmas: float = setting(2.0, 0.0, 100.0)  # a cell whose plane residual is less, in sensor sigmas, is flat
     overlap: float = setting(0.6, 0.1, 3.0)  # standard deviation of a Gaussian in cell sizes
     thickness: float = setting(0.1, 1e-3, 1.0)  # standard deviation along the normal, relative to across
-    opacity: float = setting(0.7, 0.01, 0.99)
+    opacity: float = setting(0.9, 0.01, 0.99)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from tgslam import images, runtime
 from tgslam.config.schema import LossConfig, MappingConfig, SeedingConfig
+from tgslam.depth import filled
 from tgslam.gaussian_map import GaussianMap
 from tgslam.geometry import transform_points
 from tgslam.mapping.keyframe import Keyframe
@@ -48,8 +49,10 @@ class Mapper:
         self._prune()
 
     def _insert(self, keyframe: Keyframe) -> None:
-        colour, depth_m = keyframe.colour(), keyframe.depth_m()
-        wanted = self._unexplained(keyframe, depth_m)
+        """Seed Gaussians where the map is open; where the sensor saw no depth either, at a depth guessed from around."""
+        colour, measured_m = keyframe.colour(), keyframe.depth_m()
+        wanted = self._unexplained(keyframe, measured_m)
+        depth_m = filled(measured_m)
         exposure = keyframe.exposure
         cells = quadtree(
             exposure.gain * colour + exposure.bias, depth_m, wanted, self.seeding, self.loss.depth_sigma_per_m2
@@ -68,7 +71,8 @@ class Mapper:
         """[H, W] pixels that the map leaves open, or in front of whose surface the camera sees another one."""
         rendered = self.refiner.rasterizer.render(self.gaussians, keyframe.T_cw)
         sigma_m = self.loss.depth_sigma_per_m2 * depth_m**2
-        in_front = (rendered.depth_m > 0) & (depth_m < rendered.depth_m - self.config.insert_sigmas * sigma_m)
+        both = (rendered.depth_m > 0) & (depth_m > 0)
+        in_front = both & (depth_m < rendered.depth_m - self.config.insert_sigmas * sigma_m)
         return (rendered.opacity < self.config.insert_opacity) | in_front
 
     def _weigh(self, keyframe: Keyframe) -> None:

@@ -1,0 +1,53 @@
+"""What the sensor's depth image lacks or has too much of: flying pixels are dropped, holes guessed."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tgslam import runtime
+from tgslam.arrays import require
+from tgslam.kernels import depth as kernels
+
+_TOLERANCE_SIGMAS = 4.2  # three sigma of a difference of two measurements
+_STEEPEST = 5.7  # tangent of 80 degrees
+_MIN_NEIGHBOURS = 4
+
+
+def without_flying_pixels(depth_m: np.ndarray, sigma_per_m2: float, focal_px: float) -> np.ndarray:
+    """Drop measurements that fewer than half of their neighbours support: sensors interpolate across edges.
+
+    depth_m: float32 [H, W], 0 = none. sigma_per_m2: sensor noise, sigma_z = this * z^2. Returns a new [H, W] array.
+    """
+    require("depth_m", depth_m, (None, None))
+    kept = runtime.empty(depth_m.shape)
+    kernels.keep_supported(depth_m, sigma_per_m2, _TOLERANCE_SIGMAS, _STEEPEST / focal_px, _MIN_NEIGHBOURS, kept)
+    return kept
+
+
+def filled(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Guess the depth of holes: inverse depth, in which planes are affine, interpolated from coarser and coarser means.
+
+    depth_m: [H, W], 0 = none. Measurements stay as they are; an image without any comes back as it is.
+    """
+    valid = depth_m > 0
+    if valid.all() or not valid.any():
+        return depth_m
+    inverse = np.where(valid, 1.0 / np.where(valid, depth_m, 1.0), 0.0).astype(np.float32)
+    guess = _push_pull(inverse, valid.astype(np.float32))
+    return np.where(valid, depth_m, 1.0 / np.maximum(guess, 1e-3)).astype(np.float32)
+
+
+def _push_pull(value: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Weighted means of ever coarser images fill what has no weight; value is 0 where weight is."""
+    height, width = value.shape
+    if min(height, width) <= 1:
+        return np.full_like(value, value.sum() / max(float(weight.sum()), 1e-12))
+    size = ((width + 1) // 2, (height + 1) // 2)
+    total = cv2.resize(value * weight, size, interpolation=cv2.INTER_AREA)
+    share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
+    mean = np.where(share > 1e-6, total / np.maximum(share, 1e-6), 0.0).astype(np.float32)
+    coarse = _push_pull(mean, np.minimum(4.0 * share, 1.0).astype(np.float32))
+    smooth = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+    return (weight * value + (1.0 - weight) * smooth).astype(np.float32)
