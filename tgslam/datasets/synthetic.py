@@ -53,7 +53,7 @@ class SyntheticSource:
 
     def labels(self, index: int) -> NDArray[np.int32]:
         """Plane label of each pixel [H, W], an index into `planes`; -1 where the surface is no plane."""
-        return self._raycaster.render(self.pose(index))[1].label
+        return self._raycaster.view(self.pose(index)).label
 
     def planes(self) -> NDArray[np.float64]:
         """World planes [P, 4]: unit normal out of the solid and offset in m, n . x + d = 0."""

@@ -90,8 +90,8 @@ def walk(corners_m: np.ndarray, speed_m_s: float, height_m: float) -> CameraPath
     def path(time_s: float) -> Matrix4:
         leg = min(int(np.searchsorted(arrivals_s, time_s, side="right")), len(lengths) - 1)
         position = corners_m[leg] + directions[leg] * speed_m_s * (time_s - starts_s[leg])
-        yaw = yaws[0]
-        for corner in range(len(lengths) - 1):
+        yaw = yaws[max(leg - 1, 0)]
+        for corner in range(max(leg - 1, 0), min(leg + 1, len(lengths) - 1)):  # legs are longer than turns
             late_s = time_s - arrivals_s[corner]
             share = float(np.clip(0.5 + late_s / (2 * turn_s), 0.0, 1.0))
             yaw += (yaws[corner + 1] - yaws[corner]) * share * share * (3 - 2 * share)

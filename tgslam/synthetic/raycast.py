@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,8 @@ from tgslam.kernels import raycast as kernels
 from tgslam.synthetic.occlusion import VOXEL_M
 from tgslam.synthetic.scene import Scene
 from tgslam.types import Camera, FloatImage, Matrix4
+
+DeviceArrays = tuple[NDArray[Any], ...]
 
 
 @dataclass(frozen=True)
@@ -77,46 +80,55 @@ class Raycaster:
 
     def __init__(self, scene: Scene, camera: Camera) -> None:
         self._scene, self._camera = scene, camera
+        self._intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
         self._material_kind = runtime.to_device(scene.material_kind, np.int32)
         self._material = runtime.to_device(scene.material)
         self._occlusion = runtime.to_device(scene.occlusion.share)
 
+    def view(self, T_wc: Matrix4) -> View:
+        """Geometry of the view from T_wc [4, 4] (camera to world)."""
+        return _on_host(self._cast(*self._primitives(camera_scene(self._scene, self._camera, T_wc))))
+
     def render(self, T_wc: Matrix4) -> tuple[FloatImage, View]:
         """Colour [H, W, 3] float32 in [0, 1] and geometry of the view from T_wc [4, 4] (camera to world)."""
-        camera = self._camera
-        shape = (camera.height, camera.width)
-        intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
-        local = camera_scene(self._scene, camera, T_wc)
-        primitives = (
-            runtime.to_device(local.meta, np.int32),
-            runtime.to_device(local.axes),
-            runtime.to_device(local.origin),
-            runtime.to_device(local.half_m),
-        )
-        tiles_x = -(-camera.width // kernels.TILE_PX)
-        tiles_y = -(-camera.height // kernels.TILE_PX)
-        counts = runtime.empty((tiles_x * tiles_y,), np.int32)
-        lists = runtime.empty((tiles_x * tiles_y, max(len(local.meta), 1)), np.int32)
-        kernels.bin_primitives(*primitives[1:], *intrinsics, tiles_x, counts, lists)
-        depth_m, cosine = runtime.empty(shape), runtime.empty(shape)
-        primitive, label = runtime.empty(shape, np.int32), runtime.empty(shape, np.int32)
-        near_m = runtime.to_device(local.near_m)
-        kernels.cast(*primitives, near_m, counts, lists, *intrinsics, depth_m, primitive, label, cosine)
-        colour = runtime.empty((*shape, 3))
+        local = camera_scene(self._scene, self._camera, T_wc)
+        primitives, lists = self._primitives(local)
+        view = self._cast(primitives, lists)
+        colour = runtime.empty((self._camera.height, self._camera.width, 3))
         kernels.shade(
             *primitives,
             self._material_kind,
             self._material,
             runtime.to_device(local.light),
             self._occlusion,
-            near_m,
-            counts,
-            lists,
-            *intrinsics,
-            depth_m,
-            primitive,
-            label,
+            *lists,
+            *self._intrinsics,
+            view.depth_m,
+            view.primitive,
+            view.label,
             colour,
         )
-        to_host = runtime.to_host
-        return to_host(colour), View(to_host(depth_m), to_host(primitive), to_host(label), to_host(cosine))
+        return runtime.to_host(colour), _on_host(view)
+
+    def _primitives(self, local: CameraScene) -> tuple[DeviceArrays, DeviceArrays]:
+        """The kernels' arguments (meta, axes, origin, half_m) and (near_m, counts, lists)."""
+        axes, origin, half_m = (runtime.to_device(array) for array in (local.axes, local.origin, local.half_m))
+        tiles_x = -(-self._camera.width // kernels.TILE_PX)
+        tiles_y = -(-self._camera.height // kernels.TILE_PX)
+        counts = runtime.empty((tiles_x * tiles_y,), np.int32)
+        lists = runtime.empty((tiles_x * tiles_y, len(local.meta)), np.int32)
+        kernels.bin_primitives(axes, origin, half_m, *self._intrinsics, tiles_x, counts, lists)
+        meta = runtime.to_device(local.meta, np.int32)
+        return (meta, axes, origin, half_m), (runtime.to_device(local.near_m), counts, lists)
+
+    def _cast(self, primitives: DeviceArrays, lists: DeviceArrays) -> View:
+        shape = (self._camera.height, self._camera.width)
+        depth_m, cosine = runtime.empty(shape), runtime.empty(shape)
+        primitive, label = runtime.empty(shape, np.int32), runtime.empty(shape, np.int32)
+        kernels.cast(*primitives, *lists, *self._intrinsics, depth_m, primitive, label, cosine)
+        return View(depth_m, primitive, label, cosine)
+
+
+def _on_host(view: View) -> View:
+    to_host = runtime.to_host
+    return View(to_host(view.depth_m), to_host(view.primitive), to_host(view.label), to_host(view.cosine))
