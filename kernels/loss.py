@@ -358,32 +358,42 @@ def colour_gradient(
     epsilon: ti.f32,  # Charbonnier, intensity
     scale: ti.f32,  # of the intensity term
     g_colour: F3,  # [H, W, 3] out
+    w_colour: F2,  # [H, W] out: curvature of the intensity term by a rendered channel, the same for all three
     sums: F2,  # [H SPLIT, 3] out: sum of the intensity penalty, derivatives by gain and by bias
 ):
-    """Intensity term of Eq. 12, and the chain rule of all terms to the rendered colour, gain and bias."""
+    """Intensity term of Eq. 12, and the chain rule of all terms to the rendered colour, gain and bias.
+
+    The curvature is that of reweighted least squares with one weight a pixel, from the mean square of its residuals.
+    """
     width = colour.shape[1]
     for s in range(colour.shape[0] * SPLIT):
         i, begin, end = segment(s, by_luma.shape[1])
         total, by_gain, by_bias = 0.0, 0.0, 0.0
         for b in range(begin, end):
-            luma, m = by_luma[i, b], Lanes(0.0)
+            luma, m, squares = by_luma[i, b], Lanes(0.0), Lanes(0.0)
             for k in ti.static(range(LANES)):
                 j = ti.min(b * LANES + k, width - 1)
                 m[k] = ti.select((b * LANES + k < width) and (opacity[i, j] >= min_opacity), mask[i, j], 0.0)
-            for c in ti.static(range(3)):
+            for c in range(3):  # not static: a third of the code to compile
+                share = ti.select(c == 0, LUMA[0], ti.select(c == 1, LUMA[1], LUMA[2]))
                 value, r = Lanes(0.0), Lanes(0.0)
                 for k in ti.static(range(LANES)):
                     j = ti.min(b * LANES + k, width - 1)
                     value[k] = colour[i, j, c]
                     r[k] = gain * value[k] + bias - colour_gt[i, j, c]
+                squares += r * r
                 root = ti.sqrt(r * r + epsilon * epsilon)
-                g = m * (scale * r / root + LUMA[c] * luma)
+                g = m * (scale * r / root + share * luma)
                 total += (m * (root - epsilon)).sum()
                 by_gain += (g * value).sum()
                 by_bias += g.sum()
                 for k in ti.static(range(LANES)):
                     if b * LANES + k < width:
                         g_colour[i, b * LANES + k, c] = gain * g[k]
+            w = m * (scale * gain * gain) / ti.sqrt(squares / 3.0 + epsilon * epsilon)
+            for k in ti.static(range(LANES)):
+                if b * LANES + k < width:
+                    w_colour[i, b * LANES + k] = w[k]
         sums[s, 0] = total
         sums[s, 1] = by_gain
         sums[s, 2] = by_bias
@@ -402,6 +412,7 @@ def depth_gradient(
     scale: ti.f32,
     g_depth: F2,  # [H, W] out
     g_opacity: F2,  # [H, W] out
+    w_depth: F2,  # [H, W] out: curvature by depth, 1/m^2, of reweighted least squares
     sums: F2,  # [H SPLIT, 1] out: weighted sum of the penalty
 ):
     """Eq. 13 on depth / opacity, in standard deviations of the sensor's noise at the measured depth."""
@@ -409,7 +420,7 @@ def depth_gradient(
         i, begin, end = segment(s, depth.shape[1])
         total = 0.0
         for j in range(begin, end):
-            by_depth, by_opacity = 0.0, 0.0
+            by_depth, by_opacity, curvature = 0.0, 0.0, 0.0
             z = depth_gt[i, j]
             if z > 0.0 and opacity[i, j] > min_depth_opacity:
                 share = 1.0 / opacity[i, j]
@@ -419,8 +430,11 @@ def depth_gradient(
                 root = ti.sqrt(r * r + epsilon * epsilon)
                 w = 1.0 + boost * gate[i, j]
                 total += w * (root - epsilon)
-                by_depth = scale * w * (r / root) * per_sigma * share
+                per_metre = per_sigma * share
+                curvature = scale * w / root * per_metre * per_metre
+                by_depth = scale * w * (r / root) * per_metre
                 by_opacity = -by_depth * rendered
             g_depth[i, j] = by_depth
             g_opacity[i, j] = by_opacity
+            w_depth[i, j] = curvature
         sums[s, 0] = total

@@ -176,7 +176,7 @@ def test_repeats_bit_for_bit_and_with_a_used_workspace():
     again, _ = evaluate(rendering, observed, workspace=workspace)
     fresh, _ = evaluate(rendering, observed)
     assert again.value == fresh.value and again.g_gain == fresh.g_gain
-    for name in ("g_colour", "g_depth", "g_opacity"):
+    for name in ("g_colour", "g_depth", "g_opacity", "w_colour", "w_depth"):
         np.testing.assert_array_equal(runtime.to_host(getattr(again, name)), runtime.to_host(getattr(fresh, name)))
 
 
@@ -190,6 +190,22 @@ def test_the_gate_moves_weight_from_colour_to_depth():
     np.testing.assert_allclose(
         gt["gate"], reference_image.texture_gate(reference_image.luminance(observed[0]), 95, 0.01), atol=1e-4
     )
+
+
+def test_curvatures_are_those_of_reweighted_least_squares():
+    (_, depth, opacity), (colour_gt, depth_gt, mask) = scene(30, 41)
+    offset = np.float32(np.random.default_rng(2).normal(size=depth.shape) * 0.1)
+    colour = np.float32(colour_gt + offset[..., None])  # the same residual in all channels
+    config = replace(CONFIG, weight_grad=0.0, weight_ssim=0.0)
+    result, _ = evaluate([colour, depth, opacity], [colour_gt, depth_gt, mask], config, gain=1.0, bias=0.0)
+    expected = runtime.to_host(result.w_colour)[..., None] * (colour - colour_gt)
+    np.testing.assert_allclose(runtime.to_host(result.g_colour), expected, rtol=1e-4, atol=1e-9)
+    expected = runtime.to_host(result.w_depth) * (depth - opacity * depth_gt)
+    scale = abs(runtime.to_host(result.g_depth)).max()
+    np.testing.assert_allclose(runtime.to_host(result.g_depth), expected, rtol=1e-3, atol=1e-4 * scale)
+    brighter, _ = evaluate([colour / 1.5, depth, opacity], [colour_gt, depth_gt, mask], config, gain=1.5, bias=0.0)
+    ratio = runtime.to_host(brighter.w_colour)[mask > 0] / runtime.to_host(result.w_colour)[mask > 0]
+    np.testing.assert_allclose(ratio, 1.5**2, rtol=1e-3)
 
 
 def test_wrong_arrays_are_named():

@@ -45,6 +45,8 @@ class LossResult:
     g_opacity: np.ndarray  # [H, W] by accumulated opacity
     g_gain: float
     g_bias: float
+    w_colour: np.ndarray  # [H, W] curvature of the intensity term by a rendered channel (reweighted least squares)
+    w_depth: np.ndarray  # [H, W] curvature of E_geo by accumulated depth, 1/m^2
 
 
 class Workspace:
@@ -62,6 +64,8 @@ class Workspace:
         self.g_colour = runtime.empty((height, width, 3))
         self.g_depth = runtime.empty((height, width))
         self.g_opacity = runtime.empty((height, width))
+        self.w_colour = runtime.empty((height, width))
+        self.w_depth = runtime.empty((height, width))
         self.sums1 = runtime.empty((height * kernels.SPLIT, 1))
         self.sums3 = runtime.empty((height * kernels.SPLIT, 3))
 
@@ -135,13 +139,14 @@ def rgbd_loss(
     ssim, grad = _structure(observation, config, per_inner, work)
     kernels.colour_gradient(
         colour, observation.colour, opacity, observation.mask, work.by_luma, gain, bias, min_opacity,
-        config.charbonnier_colour, config.weight_pho * config.weight_l1 * per_pixel, work.g_colour, work.sums3,
+        config.charbonnier_colour, config.weight_pho * config.weight_l1 * per_pixel, work.g_colour, work.w_colour,
+        work.sums3,
     )  # fmt: skip
     l1, g_gain, g_bias = _totals(work.sums3)
     kernels.depth_gradient(
         depth, opacity, observation.depth_m, observation.gate, config.gate_depth_boost, config.depth_sigma_per_m2,
         config.charbonnier_depth_sigmas, config.min_depth_opacity, config.weight_geo * per_depth,
-        work.g_depth, work.g_opacity, work.sums1,
+        work.g_depth, work.g_opacity, work.w_depth, work.sums1,
     )  # fmt: skip
     (geo,) = _totals(work.sums1)
     parts = {"l1": l1 * per_pixel, "grad": grad * per_inner, "ssim": ssim * per_inner, "geo": geo * per_depth}
@@ -150,7 +155,9 @@ def rgbd_loss(
     )
     value = config.weight_pho * photometric + config.weight_geo * parts["geo"]
     parts |= {"pixels": pixels, "depths": depths}
-    return LossResult(value, parts, work.g_colour, work.g_depth, work.g_opacity, g_gain, g_bias)
+    return LossResult(
+        value, parts, work.g_colour, work.g_depth, work.g_opacity, g_gain, g_bias, work.w_colour, work.w_depth
+    )
 
 
 def _structure(observation: Observation, config: LossConfig, per_inner: float, work: Workspace) -> tuple[float, float]:
