@@ -12,7 +12,8 @@ from tgslam.kernels import procedural
 
 from tests.reference import raycast as reference
 from tgslam.config.loader import load
-from tgslam.config.schema import SyntheticConfig
+from tgslam.config.schema import DatasetConfig, SyntheticConfig
+from tgslam.datasets import open_source
 from tgslam.datasets.synthetic import SyntheticSource
 from tgslam.datasets.tum import open_tum
 from tgslam.errors import ConfigError
@@ -242,6 +243,11 @@ def test_what_a_source_offers():
         one.read(-1)
 
 
+def test_the_default_dataset_is_the_synthetic_room():
+    opened = open_source(DatasetConfig(), SyntheticConfig(), 0, None)
+    assert isinstance(opened, SyntheticSource) and opened.name == "synthetic-room"
+
+
 def test_an_unknown_scene_is_an_error_that_names_the_scenes():
     with pytest.raises(ConfigError) as caught:
         source("castle")
@@ -267,3 +273,5 @@ def test_export_writes_a_tum_folder(tmp_path: Path, capsys):
     np.testing.assert_allclose(matrix_from_quat_wxyz(rows[2, [7, 4, 5, 6]]), one.pose(2)[:3, :3], atol=1e-7)
     assert export_synthetic.main(arguments) != 0
     assert "not an empty folder" in capsys.readouterr().err
+    assert export_synthetic.main([str(tmp_path / "none"), "--frames", "0"]) == ConfigError.exit_code
+    assert "synthetic.frames" in capsys.readouterr().err and not (tmp_path / "none").exists()

@@ -6,6 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from tgslam.config.loader import load
 from tgslam.config.schema import SyntheticConfig
 from tgslam.datasets.synthetic import SyntheticSource
 from tgslam.errors import OutputError, TgslamError
@@ -73,17 +74,11 @@ def _parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """Run the tool and return its exit status."""
     options = _parser().parse_args(arguments)
-    config = SyntheticConfig(
-        scene=options.scene,
-        frames=options.frames,
-        width=options.width,
-        height=options.height,
-        noise=not options.clean,
-        exposure_change=options.exposure_change,
-        motion_blur=options.motion_blur,
-    )
+    keys = ("scene", "frames", "width", "height", "exposure_change", "motion_blur")
+    settings = [f"synthetic.{key}={getattr(options, key)}" for key in keys]
     try:
-        source = SyntheticSource(config, options.seed)
+        config = load(None, [*settings, f"synthetic.noise={str(not options.clean).lower()}"])
+        source = SyntheticSource(config.synthetic, options.seed)
         export(source, options.folder)
     except TgslamError as error:
         print(f"error: {error}", file=sys.stderr)
