@@ -12,11 +12,12 @@ import pytest
 CHECKOUT = Path(__file__).resolve().parents[1]
 
 # The units of tgslam from the bottom up: a unit imports from its own line or one above it here, and never in a circle.
+# What is not listed is an op wrapper: a module round kernels, such as render, losses, images or optim.
 RANKS = (
     {"errors", "geometry", "types"},
     {"kernels", "configs", "config"},
     {"runtime"},
-    {"arrays", "gaussian_map", "images", "losses", "optim", "plane_fit", "render", "vector_adam"},  # op wrappers
+    {"op wrappers"},
     {"closures", "keyframes", "mapping", "planes", "pose_graph", "synthetic", "tracking"},
     {"datasets", "slam"},
     {"evaluation", "output"},
@@ -24,7 +25,7 @@ RANKS = (
     {"cli"},
     {"__main__"},
 )
-RANK = {name: rank for rank, names in enumerate(RANKS) for name in names}
+RANKED = {name: rank for rank, names in enumerate(RANKS) for name in names}
 SYSTEM = {
     "slam",
     "keyframes",
@@ -83,14 +84,13 @@ def units_imported(name: str) -> set[str]:
     return {parts(target) for target in targets} - {parts(name), "__version__"}
 
 
-def test_every_unit_has_its_place_in_the_layers() -> None:
-    unknown = {parts(name) for name in MODULES} - set(RANK) - {"__init__"}
-    assert not unknown, f"add {unknown} to RANKS"
+def rank(unit: str) -> int:
+    return RANKED.get(unit, RANKED["op wrappers"])
 
 
-@pytest.mark.parametrize("name", MODULES)
+@pytest.mark.parametrize("name", [name for name in MODULES if name != "__init__"])
 def test_imports_point_one_way(name: str) -> None:
-    above = {unit for unit in units_imported(name) if RANK.get(unit, 0) > RANK.get(parts(name), 0)}
+    above = {unit for unit in units_imported(name) if rank(unit) > rank(parts(name))}
     assert not above, f"{name} imports from the layers above it: {above}"
 
 
