@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tgslam.kernels.projection import BLUR
 from tgslam.kernels.simd import ALPHA_MIN, T_MIN
 
 from tests.reference.projection import NAMES, Parameters, parameters, project
@@ -480,7 +481,7 @@ def test_alpha_at_the_threshold(factor: float) -> None:
 
 def test_the_drawn_set_of_pixels_is_the_twins() -> None:
     """One splat a picture: opacity is non-zero exactly where the twin's alpha passes, so culling cuts nothing off."""
-    scene = random_gaussians(30, CAMERA, seed=17, tangent=1.2, scale_m=(0.01, 0.4), logit=(-5.0, 4.0))
+    scene = random_gaussians(300, CAMERA, seed=17, tangent=1.2, scale_m=(0.01, 0.4), logit=(-5.0, 4.0))
     rasterizer = Rasterizer(CAMERA)
     for i in range(len(scene)):
         one = make_gaussians(**{name: getattr(scene, name)[i : i + 1] for name in NAMES})
@@ -488,6 +489,25 @@ def test_the_drawn_set_of_pixels_is_the_twins() -> None:
         drawn = rasterizer.forward(GaussianMap.from_gaussians(one), POSE).opacity > 0
         decided = ~undecided(p, POSE, CAMERA, BAND)
         np.testing.assert_array_equal(drawn[decided], decisions_at(p, POSE, CAMERA).drawn[0][decided])
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("last_pixel", "side"), [(15, -1.0), (32, 1.0)])
+def test_a_splat_reaches_into_the_next_tile_by_a_hair(axis: int, last_pixel: int, side: float) -> None:
+    """A round splat on the optical axis whose rim passes a pixel of the neighbouring tile by 0.02 px."""
+    opacity, scale_px = 0.6, 2.5
+    reach = np.sqrt(2.0 * np.log(opacity / ALPHA_MIN) * (scale_px**2 + BLUR))
+    centre = [24.0, 24.0]
+    centre[axis] = last_pixel - side * (reach - 0.02)
+    camera = Camera(48, 48, 50.0, 50.0, *centre)
+    gaussians = make_gaussians(
+        mean=[[0.0, 0.0, 1.0]],
+        log_scale=np.full((1, 3), np.log(scale_px / 50.0)),
+        opacity_logit=[np.log(opacity / (1.0 - opacity))],
+    )
+    images = Rasterizer(camera).forward(GaussianMap.from_gaussians(gaussians), np.eye(4))
+    drawn = np.argwhere(images.opacity)[:, 1 - axis]  # columns for x, rows for y
+    assert (drawn.max() if side > 0 else drawn.min()) == last_pixel
 
 
 def test_a_thousand_gaussians_in_a_tile() -> None:
