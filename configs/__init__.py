@@ -1,1 +1,1 @@
-"""YAML overrides by dataset family. Every default lives in `tgslam.config.schema`; these files say only what differs."""
+"""YAML overrides by dataset family. Every default lives in `tgslam.config.schema`; a file says only what differs."""

@@ -1,19 +1,23 @@
 """Gauss-Newton normal equations of RGB-D alignment: point-to-plane depth, intensity and intensity gradient.
 
-The unknowns are a left perturbation of T_ml (live camera to model camera) and the live frame's gain and bias.
-Model and live images share one camera. Each image row has one writer, so the sums repeat bit for bit.
+The unknowns are a left perturbation of T_ml (live camera to model camera). Model and live images share one camera.
+Moments of the matched intensities come along, from which the exposure follows in closed form.
+Every partial sum has one writer, so the sums repeat bit for bit.
 """
 
 import taichi as ti
 
-nd = ti.types.ndarray
+from tgslam.kernels.image import F1, F2, F3
 
-UNKNOWNS = 8  # rotation 3, translation 3, gain, bias
+UNKNOWNS = 6  # rotation 3, translation 3
 TRIANGLE = UNKNOWNS * (UNKNOWNS + 1) // 2
+SPLIT = 8  # segments of columns a row: loops of up to 512 iterations would run on one thread
+
 # Columns of a row of partial sums: upper triangle of J^T W J, J^T W r, then the statistics
 RHS = TRIANGLE
-COST, CANDIDATES, MATCHED, INLIERS, DEPTH_SUM, COLOUR_SUM, COLOUR_COUNT = (RHS + UNKNOWNS + k for k in range(7))
-PARTIAL = COLOUR_COUNT + 1
+CANDIDATES, MATCHED, INLIERS, DEPTH_SUM, COLOUR_SUM = (RHS + UNKNOWNS + k for k in range(5))
+W, W_L, W_M, W_LL, W_LM = (COLOUR_SUM + 1 + k for k in range(5))  # moments of live (L) and model (M) intensity
+PARTIAL = W_LM + 1
 
 # Entries of the settings array
 (
@@ -26,14 +30,26 @@ PARTIAL = COLOUR_COUNT + 1
     DEPTH_SIGMA,  # sigma_z = this * z^2
     MAX_DISTANCE_SIGMAS,  # depth residuals beyond are no match
     CHARBONNIER_DEPTH,  # epsilon in sigmas
+    GATE_DEPTH_BOOST,
     SIGMA_COLOUR,
     SIGMA_GRADIENT,
     WEIGHT_DEPTH,
     WEIGHT_COLOUR,
     WEIGHT_GRADIENT,
-    MIN_OPACITY,
 ) = range(15)
 SETTINGS = 15
+
+_INLIER_SIGMAS = 3.0
+_MIN_COSINE = 0.2  # grazing rays: the noise across the surface is taken to be no less than this share of that along z
+_NEAR_M = 0.05
+
+vec3 = ti.types.vector(3, ti.f32)
+vec6 = ti.types.vector(UNKNOWNS, ti.f32)
+
+
+def triangle(a, b):
+    """Index of element (a, b), a <= b, in a symmetric matrix's upper triangle stored row by row."""
+    return a * UNKNOWNS - a * (a - 1) // 2 + b - a
 
 
 @ti.func
@@ -47,132 +63,120 @@ def bilinear(image: ti.template(), u, v):
 
 
 @ti.func
-def charbonnier_weight(normalised):
-    """IRLS weight of rho(x) = sqrt(x^2 + 1): rho'(x) / x."""
+def irls_weight(normalised):
+    """Weight of the Charbonnier penalty rho(x) = sqrt(x^2 + 1) in reweighted least squares: rho'(x) / x."""
     return 1.0 / ti.sqrt(1.0 + normalised * normalised)
 
 
 @ti.func
-def image_jacobian(gx, gy, fx, fy, x: ti.template(), inv_z):
-    """d image(project(X)) / d xi for an image gradient (gx, gy) in 1/px: (X x g3, g3) with g3 the gradient in 3D."""
-    g3 = ti.Vector([gx * fx * inv_z, gy * fy * inv_z, 0.0])
-    g3[2] = -(g3[0] * x[0] + g3[1] * x[1]) * inv_z
-    turn = x.cross(g3)
-    return ti.Vector([turn[0], turn[1], turn[2], g3[0], g3[1], g3[2], 0.0, 0.0])
+def motion_jacobian(x, direction):
+    """d (direction . x) / d xi for a left perturbation of the transform that gave x: (x cross direction, direction)."""
+    turn = x.cross(direction)
+    return vec6([turn[0], turn[1], turn[2], direction[0], direction[1], direction[2]])
+
+
+@ti.func
+def image_jacobian(gx, gy, fx, fy, x, inv_z):
+    """d image(project(x)) / d xi for an image gradient (gx, gy) in 1/px."""
+    dx, dy = gx * fx * inv_z, gy * fy * inv_z
+    return motion_jacobian(x, vec3([dx, dy, -(dx * x[0] + dy * x[1]) * inv_z]))
 
 
 @ti.kernel
 def normal_equations(
-    settings: nd(ti.f32, ndim=1),  # [SETTINGS]
-    T_ml: nd(ti.f32, ndim=1),  # [12] live camera to model camera
-    step: ti.i32,  # only every step-th pixel of every step-th row
-    live_depth: nd(ti.f32, ndim=2),  # [H, W] m
-    live_grey: nd(ti.f32, ndim=2),  # [H, W]
-    live_gx: nd(ti.f32, ndim=2),  # [H, W] 1/px
-    live_gy: nd(ti.f32, ndim=2),  # [H, W]
-    gate: nd(ti.f32, ndim=2),  # [H, W] T of Eq. 11: 1 = no texture
-    model_depth: nd(ti.f32, ndim=2),  # [H, W] m
-    model_normal: nd(ti.f32, ndim=3),  # [H, W, 3] model camera frame, 0 = none
-    model_grey: nd(ti.f32, ndim=2),  # [H, W]
-    model_gx: nd(ti.f32, ndim=2),  # [H, W]
-    model_gy: nd(ti.f32, ndim=2),  # [H, W]
-    model_gxx: nd(ti.f32, ndim=2),  # [H, W] derivatives of the gradient images
-    model_gxy: nd(ti.f32, ndim=2),  # [H, W]
-    model_gyy: nd(ti.f32, ndim=2),  # [H, W]
-    partial: nd(ti.f32, ndim=2),  # [rows, PARTIAL] out
+    settings: F1,  # [SETTINGS]
+    T_ml: F1,  # [12] live camera to model camera
+    live_depth: F2,  # [H, W] m
+    live_grey: F2,  # [H, W]
+    live_gx: F2,  # [H, W] 1/px
+    live_gy: F2,  # [H, W]
+    gate: F2,  # [H, W] T of Eq. 11: 1 = no texture
+    model_depth: F2,  # [H, W] m
+    model_normal: F3,  # [H, W, 3] model camera frame, 0 = none
+    model_grey: F2,  # [H, W]
+    model_gx: F2,  # [H, W]
+    model_gy: F2,  # [H, W]
+    model_gxx: F2,  # [H, W] derivatives of the gradient images
+    model_gxy: F2,  # [H, W]
+    model_gyy: F2,  # [H, W]
+    partial: F2,  # [H * SPLIT, PARTIAL] out
 ):
-    """Sum the weighted normal equations of Eqs. 12, 13 over the live pixels, one row of sums a row of pixels.
+    """Sum the weighted normal equations of Eqs. 12, 13 over the live pixels, a row of sums for a segment of pixels.
 
     SSIM (Eq. 12's third term) is no sum of squares and is left to the first-order solver.
     """
-    for line in range(partial.shape[0]):
-        for c in ti.static(range(PARTIAL)):
-            partial[line, c] = 0.0
-        v = line * step
-        fx, fy = settings[FX], settings[FY]
+    for part in range(partial.shape[0]):
         height, width = live_depth.shape[0], live_depth.shape[1]
-        A = ti.Vector([0.0] * TRIANGLE)
-        rhs = ti.Vector([0.0] * UNKNOWNS)
-        cost, candidates, matched, inliers, depth_sum, colour_sum, colour_count = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for i in range((width + step - 1) // step):
-            u = i * step
+        v = part // SPLIT
+        begin, end = (part - v * SPLIT) * width // SPLIT, (part - v * SPLIT + 1) * width // SPLIT
+        fx, fy, cx, cy = settings[FX], settings[FY], settings[CX], settings[CY]
+        sums = ti.Vector([0.0] * PARTIAL)
+        for u in range(begin, end):
             z = live_depth[v, u]
             if z > 0.0:
-                ray = ti.Vector([(u - settings[CX]) / fx * z, (v - settings[CY]) / fy * z, z])
-                x = ti.Vector([T_ml[4 * r] * ray[0] + T_ml[4 * r + 1] * ray[1] + T_ml[4 * r + 2] * ray[2] + T_ml[4 * r + 3]
-                               for r in range(3)])  # fmt: skip
-                inv_z = 1.0 / ti.max(x[2], 1e-3)
-                um, vm = fx * x[0] * inv_z + settings[CX], fy * x[1] * inv_z + settings[CY]
-                if x[2] > 0.05 and um >= 1.0 and vm >= 1.0 and um < width - 2.0 and vm < height - 2.0:
+                ray = vec3([(u - cx) / fx * z, (v - cy) / fy * z, z])
+                x = vec3([T_ml[3], T_ml[7], T_ml[11]])
+                for r in ti.static(range(3)):
+                    for c in ti.static(range(3)):
+                        x[r] += T_ml[4 * r + c] * ray[c]
+                inv_z = 1.0 / ti.max(x[2], _NEAR_M)
+                um, vm = fx * x[0] * inv_z + cx, fy * x[1] * inv_z + cy
+                if x[2] > _NEAR_M and um >= 1.0 and vm >= 1.0 and um < width - 2.0 and vm < height - 2.0:
                     un, vn = ti.cast(um + 0.5, ti.i32), ti.cast(vm + 0.5, ti.i32)
                     zm = model_depth[vn, un]
-                    n = ti.Vector([model_normal[vn, un, 0], model_normal[vn, un, 1], model_normal[vn, un, 2]])
                     if zm > 0.0:
-                        candidates += 1.0
+                        sums[CANDIDATES] += 1.0
                         sigma_z = settings[DEPTH_SIGMA] * z * z
-                        point = ti.Vector([(un - settings[CX]) / fx * zm, (vn - settings[CY]) / fy * zm, zm])
+                        n = vec3([model_normal[vn, un, 0], model_normal[vn, un, 1], model_normal[vn, un, 2]])
                         has_normal = n.dot(n) > 0.5
-                        r = n.dot(x - point)
-                        along = ti.abs(x[2] - zm)
-                        if has_normal:
-                            # what the tangent plane says of the distance along the ray
-                            along = ti.abs(r) / ti.max(-n.dot(x) * inv_z, 0.2)
+                        cosine = ti.max(-n.dot(ray) / ray.norm(), _MIN_COSINE)
+                        distance = n.dot(x - vec3([(un - cx) / fx * zm, (vn - cy) / fy * zm, zm]))
+                        along = ti.select(has_normal, ti.abs(distance) / cosine, ti.abs(x[2] - zm))
                         if along < settings[MAX_DISTANCE_SIGMAS] * sigma_z:
-                            matched += 1.0
-                            texture = 1.0 - gate[v, u]
+                            sums[MATCHED] += 1.0
                             if has_normal:
-                                cosine = ti.max(-n.dot(ray) / ray.norm(), 0.2)
-                                sigma = sigma_z * cosine
-                                e = r / sigma
-                                w = settings[WEIGHT_DEPTH] * (1.0 + gate[v, u])
-                                w *= charbonnier_weight(e / settings[CHARBONNIER_DEPTH])
-                                inliers += ti.select(ti.abs(e) < 3.0, 1.0, 0.0)
-                                depth_sum += ti.abs(e)
-                                cost += w * e * e
-                                turn = x.cross(n) / sigma
-                                J = ti.Vector([turn[0], turn[1], turn[2], n[0] / sigma, n[1] / sigma, n[2] / sigma])
-                                k = 0
-                                for a in ti.static(range(6)):
-                                    rhs[a] += w * e * J[a]
-                                    for b in ti.static(range(a, 6)):
-                                        A[a * UNKNOWNS - a * (a - 1) // 2 + b - a] += w * J[a] * J[b]
-                            gain, bias = settings[GAIN], settings[BIAS]
-                            if settings[WEIGHT_COLOUR] > 0.0:
-                                gx, gy = bilinear(model_gx, um, vm), bilinear(model_gy, um, vm)
-                                s = 1.0 / settings[SIGMA_COLOUR]
-                                e = s * (bilinear(model_grey, um, vm) - gain * live_grey[v, u] - bias)
-                                w = settings[WEIGHT_COLOUR] * charbonnier_weight(e)
-                                colour_sum += ti.abs(e)
-                                colour_count += 1.0
-                                cost += w * e * e
-                                J = s * image_jacobian(gx, gy, fx, fy, x, inv_z)
-                                J[6], J[7] = -s * live_grey[v, u], -s
+                                inv_sigma = 1.0 / (sigma_z * cosine)
+                                e = distance * inv_sigma
+                                w = settings[WEIGHT_DEPTH] * (1.0 + settings[GATE_DEPTH_BOOST] * gate[v, u])
+                                w *= irls_weight(e / settings[CHARBONNIER_DEPTH])
+                                sums[INLIERS] += ti.select(ti.abs(e) < _INLIER_SIGMAS, 1.0, 0.0)
+                                sums[DEPTH_SUM] += ti.abs(e)
+                                J = inv_sigma * motion_jacobian(x, n)
                                 for a in ti.static(range(UNKNOWNS)):
-                                    rhs[a] += w * e * J[a]
+                                    sums[RHS + a] += w * e * J[a]
                                     for b in ti.static(range(a, UNKNOWNS)):
-                                        A[a * UNKNOWNS - a * (a - 1) // 2 + b - a] += w * J[a] * J[b]
-                                if settings[WEIGHT_GRADIENT] > 0.0:
-                                    sg = 1.0 / settings[SIGMA_GRADIENT]
-                                    gxy = bilinear(model_gxy, um, vm)
-                                    for axis in ti.static(range(2)):
-                                        live_g = ti.select(axis == 0, live_gx[v, u], live_gy[v, u])
-                                        value = ti.select(axis == 0, gx, gy)
-                                        e = sg * (value - gain * live_g)
-                                        w = settings[WEIGHT_GRADIENT] * texture * charbonnier_weight(e)
-                                        cost += w * e * e
-                                        if ti.static(axis == 0):
-                                            J = sg * image_jacobian(bilinear(model_gxx, um, vm), gxy, fx, fy, x, inv_z)
-                                        else:
-                                            J = sg * image_jacobian(gxy, bilinear(model_gyy, um, vm), fx, fy, x, inv_z)
-                                        J[6] = -sg * live_g
-                                        for a in ti.static(range(7)):
-                                            rhs[a] += w * e * J[a]
-                                            for b in ti.static(range(a, 7)):
-                                                A[a * UNKNOWNS - a * (a - 1) // 2 + b - a] += w * J[a] * J[b]
-        for c in ti.static(range(TRIANGLE)):
-            partial[line, c] = A[c]
-        for c in ti.static(range(UNKNOWNS)):
-            partial[line, RHS + c] = rhs[c]
-        partial[line, COST], partial[line, CANDIDATES], partial[line, MATCHED] = cost, candidates, matched
-        partial[line, INLIERS], partial[line, DEPTH_SUM] = inliers, depth_sum
-        partial[line, COLOUR_SUM], partial[line, COLOUR_COUNT] = colour_sum, colour_count
+                                        sums[ti.static(triangle(a, b))] += w * J[a] * J[b]
+                            # intensity
+                            live, model = live_grey[v, u], bilinear(model_grey, um, vm)
+                            gx, gy = bilinear(model_gx, um, vm), bilinear(model_gy, um, vm)
+                            inv_colour = 1.0 / settings[SIGMA_COLOUR]
+                            e = inv_colour * (model - settings[GAIN] * live - settings[BIAS])
+                            robust = irls_weight(e)
+                            w = settings[WEIGHT_COLOUR] * robust
+                            sums[COLOUR_SUM] += ti.abs(e)
+                            sums[W] += robust
+                            sums[W_L] += robust * live
+                            sums[W_M] += robust * model
+                            sums[W_LL] += robust * live * live
+                            sums[W_LM] += robust * live * model
+                            J = inv_colour * image_jacobian(gx, gy, fx, fy, x, inv_z)
+                            for a in ti.static(range(UNKNOWNS)):
+                                sums[RHS + a] += w * e * J[a]
+                                for b in ti.static(range(a, UNKNOWNS)):
+                                    sums[ti.static(triangle(a, b))] += w * J[a] * J[b]
+                            # gradient, where there is texture
+                            texture = 1.0 - gate[v, u]
+                            if settings[WEIGHT_GRADIENT] * texture > 0.0:
+                                inv_gradient = 1.0 / settings[SIGMA_GRADIENT]
+                                gxy = bilinear(model_gxy, um, vm)
+                                ex = inv_gradient * (gx - settings[GAIN] * live_gx[v, u])
+                                ey = inv_gradient * (gy - settings[GAIN] * live_gy[v, u])
+                                wg = settings[WEIGHT_GRADIENT] * texture * irls_weight(ti.sqrt(ex * ex + ey * ey))
+                                Jx = image_jacobian(bilinear(model_gxx, um, vm), gxy, fx, fy, x, inv_z) * inv_gradient
+                                Jy = image_jacobian(gxy, bilinear(model_gyy, um, vm), fx, fy, x, inv_z) * inv_gradient
+                                for a in ti.static(range(UNKNOWNS)):
+                                    sums[RHS + a] += wg * (ex * Jx[a] + ey * Jy[a])
+                                    for b in ti.static(range(a, UNKNOWNS)):
+                                        sums[ti.static(triangle(a, b))] += wg * (Jx[a] * Jx[b] + Jy[a] * Jy[b])
+        for c in ti.static(range(PARTIAL)):
+            partial[part, c] = sums[c]

@@ -2,6 +2,8 @@
 
 import taichi as ti
 
+from tgslam.kernels.image import SPLIT, segment
+
 nd = ti.types.ndarray
 
 
@@ -16,8 +18,9 @@ def keep_supported(
 ):
     """Keep the measurements with enough of their 8 neighbours at like depth."""
     height, width = depth.shape[0], depth.shape[1]
-    for y in range(height):
-        for x in range(width):
+    for s in range(height * SPLIT):
+        y, begin, end = segment(s, width)
+        for x in range(begin, end):
             z = depth[y, x]
             tolerance = (tolerance_sigmas * sigma_per_m2 * z + slope) * z
             count = 0

@@ -17,6 +17,7 @@ The passes over one image, in order:
 import math
 
 import taichi as ti
+
 from tgslam.kernels.image import F2, F3, SPLIT, segment
 from tgslam.kernels.simd import LANES, Lanes
 

@@ -5,6 +5,7 @@ Columns of a splat row (and of its gradient) are the constants below.
 """
 
 import taichi as ti
+
 from tgslam.kernels.simd import ALPHA_MIN, TILE
 
 nd = ti.types.ndarray
@@ -19,7 +20,7 @@ SPLAT_GRAD = 17  # a gradient row has two more: the summed weights of the colour
 BLUR = 0.3  # px^2 added to the screen covariance, the 3DGS standard's low-pass filter
 NEAR_M = 0.05
 EDGE = 1.3  # the Jacobian is evaluated at most this many half-images off the axis
-POSE_BLOCK = 512  # Gaussians whose pose gradients one writer sums
+POSE_BLOCK = 32  # Gaussians whose pose gradients one writer sums
 
 
 @ti.func

@@ -12,6 +12,7 @@ Two-dimensional vector arrays throughout: a one-dimensional one is loaded as a g
 
 import taichi as ti
 
+from tgslam.kernels.image import SPLIT, segment
 from tgslam.kernels.projection import (
     CURVATURE_COLOUR,
     CURVATURE_DEPTH,
@@ -36,6 +37,7 @@ from tgslam.kernels.simd import (
     CHUNKS,
     LANES,
     PER_ROW,
+    SPREAD,
     T_MIN,
     TILE,
     LaneBits,
@@ -105,26 +107,31 @@ def pack_slots(
     mask: nd(ti.i32, ndim=1),  # [slots] out: bit c = the splat reaches chunk c
 ):
     """Copy splat rows into slot order and find the chunks each reaches; the lanes are the 16 chunks."""
-    for tile in range(tiles):
-        x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        for k in range(start[tile], start[tile + 1]):
-            i = ids[k]
-            for c in ti.static(range(SPLAT)):
-                slot[k, c] = splat[i, c]
-            u, v = splat[i, U] - x0, splat[i, V] - y0
-            slot[k, U], slot[k, V] = u, v
-            a, b, c_ = splat[i, QA], splat[i, QB], splat[i, QC]
-            reach = ti.log(ti.max(splat[i, OPACITY] / ALPHA_MIN, 1.0)) * 1.0001 + 1e-5
-            slope_y, slope_x = -b / (2.0 * c_), -b / (2.0 * a)
-            hit = LaneBits(0)
-            for j in ti.static(range(LANES)):
-                xa, ya = (j % PER_ROW) * CHUNK - u, (j // PER_ROW) * CHUNK - v
-                xb, yb = xa + (CHUNK - 1), ya + (CHUNK - 1)
-                xn, yn = ti.min(ti.max(0.0, xa), xb), ti.min(ti.max(0.0, ya), yb)  # chunk lines nearest to the centre
-                y1, x1 = ti.min(ti.max(slope_y * xn, ya), yb), ti.min(ti.max(slope_x * yn, xa), xb)
-                q = ti.min((a * xn + b * y1) * xn + c_ * y1 * y1, (a * x1 + b * yn) * x1 + c_ * yn * yn)
-                hit[j] = ti.select(q <= reach, 1 << j, 0)
-            mask[k] = hit.sum()
+    for spread in range(tiles * SPREAD):
+        tile = spread // SPREAD
+        if spread - tile * SPREAD == 0:
+            x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+            for k in range(start[tile], start[tile + 1]):
+                i = ids[k]
+                for c in ti.static(range(SPLAT)):
+                    slot[k, c] = splat[i, c]
+                u, v = splat[i, U] - x0, splat[i, V] - y0
+                slot[k, U], slot[k, V] = u, v
+                a, b, c_ = splat[i, QA], splat[i, QB], splat[i, QC]
+                reach = ti.log(ti.max(splat[i, OPACITY] / ALPHA_MIN, 1.0)) * 1.0001 + 1e-5
+                slope_y, slope_x = -b / (2.0 * c_), -b / (2.0 * a)
+                hit = LaneBits(0)
+                for j in ti.static(range(LANES)):
+                    xa, ya = (j % PER_ROW) * CHUNK - u, (j // PER_ROW) * CHUNK - v
+                    xb, yb = xa + (CHUNK - 1), ya + (CHUNK - 1)
+                    xn, yn = (
+                        ti.min(ti.max(0.0, xa), xb),
+                        ti.min(ti.max(0.0, ya), yb),
+                    )  # chunk lines nearest to the centre
+                    y1, x1 = ti.min(ti.max(slope_y * xn, ya), yb), ti.min(ti.max(slope_x * yn, xa), xb)
+                    q = ti.min((a * xn + b * y1) * xn + c_ * y1 * y1, (a * x1 + b * yn) * x1 + c_ * yn * yn)
+                    hit[j] = ti.select(q <= reach, 1 << j, 0)
+                mask[k] = hit.sum()
 
 
 @ti.kernel
@@ -138,48 +145,50 @@ def forward(
     out: nd(Lanes, ndim=2),  # [tiles * CHUNKS, OUT] out: sums of weight times channel, and the transmittance left
 ):
     """Alpha blending front to back: colour, tangent-plane depth, embedding colour, transmittance."""
-    for tile in range(tiles):
-        first = start[tile]
-        for chunk in range(CHUNKS):
-            n = 0
-            for k in range(first, start[tile + 1]):
-                todo[first + n] = k
-                n += (mask[k] >> chunk) & 1
-            cx, cy = ti.cast((chunk % PER_ROW) * CHUNK, ti.f32), ti.cast((chunk // PER_ROW) * CHUNK, ti.f32)
-            T, r, g, b, d = Lanes(1.0), Lanes(0.0), Lanes(0.0), Lanes(0.0), Lanes(0.0)
-            e0, e1, e2 = Lanes(0.0), Lanes(0.0), Lanes(0.0)
-            m, done = 0, n
-            while m < done:
-                k = todo[first + m]
-                dx0, dy0 = cx - slot[k, U], cy - slot[k, V]
-                qa, qb, qc, op = slot[k, QA], slot[k, QB], slot[k, QC], slot[k, OPACITY]
-                z, zu, zv = slot[k, Z], slot[k, ZU], slot[k, ZV]
-                c0, c1, c2 = slot[k, RED], slot[k, RED + 1], slot[k, RED + 2]
-                for j in ti.static(range(LANES)):
-                    dx, dy = dx0 + (j % CHUNK), dy0 + (j // CHUNK)
-                    alpha = ti.min(ALPHA_MAX, op * exp_neg((qa * dx + qb * dy) * dx + qc * dy * dy))
-                    alpha = ti.select(alpha > ALPHA_MIN, alpha, 0.0)
-                    w = T[j] * alpha
-                    r[j] += w * c0
-                    g[j] += w * c1
-                    b[j] += w * c2
-                    d[j] += w * (z + zu * dx + zv * dy)
-                    if ti.static(with_embedding):
-                        e0[j] += w * slot[k, EMBEDDING]
-                        e1[j] += w * slot[k, EMBEDDING + 1]
-                        e2[j] += w * slot[k, EMBEDDING + 2]
-                    T[j] -= w
-                m += 1
-                if (m & 7) == 0:
-                    if T.max() < T_MIN:
-                        done = m
-            for rest in range(done, n):
-                mask[todo[first + rest]] &= ~(1 << chunk)
-            row = tile * CHUNKS + chunk
-            out[row, OUT_COLOUR], out[row, OUT_COLOUR + 1], out[row, OUT_COLOUR + 2] = r, g, b
-            out[row, OUT_DEPTH], out[row, OUT_T] = d, T
-            if ti.static(with_embedding):
-                out[row, OUT_EMBEDDING], out[row, OUT_EMBEDDING + 1], out[row, OUT_EMBEDDING + 2] = e0, e1, e2
+    for spread in range(tiles * SPREAD):
+        tile = spread // SPREAD
+        if spread - tile * SPREAD == 0:
+            first = start[tile]
+            for chunk in range(CHUNKS):
+                n = 0
+                for k in range(first, start[tile + 1]):
+                    todo[first + n] = k
+                    n += (mask[k] >> chunk) & 1
+                cx, cy = ti.cast((chunk % PER_ROW) * CHUNK, ti.f32), ti.cast((chunk // PER_ROW) * CHUNK, ti.f32)
+                T, r, g, b, d = Lanes(1.0), Lanes(0.0), Lanes(0.0), Lanes(0.0), Lanes(0.0)
+                e0, e1, e2 = Lanes(0.0), Lanes(0.0), Lanes(0.0)
+                m, done = 0, n
+                while m < done:
+                    k = todo[first + m]
+                    dx0, dy0 = cx - slot[k, U], cy - slot[k, V]
+                    qa, qb, qc, op = slot[k, QA], slot[k, QB], slot[k, QC], slot[k, OPACITY]
+                    z, zu, zv = slot[k, Z], slot[k, ZU], slot[k, ZV]
+                    c0, c1, c2 = slot[k, RED], slot[k, RED + 1], slot[k, RED + 2]
+                    for j in ti.static(range(LANES)):
+                        dx, dy = dx0 + (j % CHUNK), dy0 + (j // CHUNK)
+                        alpha = ti.min(ALPHA_MAX, op * exp_neg((qa * dx + qb * dy) * dx + qc * dy * dy))
+                        alpha = ti.select(alpha > ALPHA_MIN, alpha, 0.0)
+                        w = T[j] * alpha
+                        r[j] += w * c0
+                        g[j] += w * c1
+                        b[j] += w * c2
+                        d[j] += w * (z + zu * dx + zv * dy)
+                        if ti.static(with_embedding):
+                            e0[j] += w * slot[k, EMBEDDING]
+                            e1[j] += w * slot[k, EMBEDDING + 1]
+                            e2[j] += w * slot[k, EMBEDDING + 2]
+                        T[j] -= w
+                    m += 1
+                    if (m & 7) == 0:
+                        if T.max() < T_MIN:
+                            done = m
+                for rest in range(done, n):
+                    mask[todo[first + rest]] &= ~(1 << chunk)
+                row = tile * CHUNKS + chunk
+                out[row, OUT_COLOUR], out[row, OUT_COLOUR + 1], out[row, OUT_COLOUR + 2] = r, g, b
+                out[row, OUT_DEPTH], out[row, OUT_T] = d, T
+                if ti.static(with_embedding):
+                    out[row, OUT_EMBEDDING], out[row, OUT_EMBEDDING + 1], out[row, OUT_EMBEDDING + 2] = e0, e1, e2
 
 
 @ti.kernel
@@ -193,8 +202,9 @@ def unpack_image(
     embedding: nd(ti.f32, ndim=3),  # [H, W, 3] out
 ):
     """Chunk layout -> images."""
-    for y in range(colour.shape[0]):
-        for x in range(colour.shape[1]):
+    for s in range(colour.shape[0] * SPLIT):
+        y, begin, end = segment(s, colour.shape[1])
+        for x in range(begin, end):
             row = ((y >> 4) * tiles_x + (x >> 4)) * CHUNKS + ((y >> 2) & 3) * PER_ROW + ((x >> 2) & 3)
             j = (y & 3) * CHUNK + (x & 3)
             for c in ti.static(range(3)):
@@ -268,94 +278,96 @@ def backward(
 
     dL/dalpha_i = T_i (g . c_i) - (g . out - sum_{k <= i} w_k g . c_k) / (1 - alpha_i), zero where alpha saturates.
     """
-    for tile in range(tiles):
-        for chunk in range(CHUNKS):
-            state[tile * CHUNKS + chunk, 0], state[tile * CHUNKS + chunk, 1] = Lanes(1.0), Lanes(0.0)
-        for k in range(start[tile], start[tile + 1]):
-            u, v, qa, qb, qc, op = slot[k, U], slot[k, V], slot[k, QA], slot[k, QB], slot[k, QC], slot[k, OPACITY]
-            z, zu, zv = slot[k, Z], slot[k, ZU], slot[k, ZV]
-            c0, c1, c2 = slot[k, RED], slot[k, RED + 1], slot[k, RED + 2]
-            for c in ti.static(range(SPLAT_GRAD)):
-                acc[tile, c] = Lanes(0.0)
-            bits = mask[k]
-            while bits != 0:
-                lowest = bits & (-bits)
-                bits ^= lowest
-                chunk = 31 - ti.math.clz(lowest)
-                row = tile * CHUNKS + chunk
-                dx0, dy0 = origin[chunk, 0] - u, origin[chunk, 1] - v
-                T, A, total = state[row, 0], state[row, 1], g[row, G_TOTAL]
-                g0, g1, g2, gd, go = g[row, 0], g[row, 1], g[row, 2], g[row, G_DEPTH], g[row, G_OPACITY]
-                ge0, ge1, ge2 = g[row, G_EMBEDDING], g[row, G_EMBEDDING + 1], g[row, G_EMBEDDING + 2]
-                wc, wd = g[row, W_COLOUR], g[row, W_DEPTH]
-                a0, a1, a2 = acc[tile, RED], acc[tile, RED + 1], acc[tile, RED + 2]
-                az, azu, azv = acc[tile, Z], acc[tile, ZU], acc[tile, ZV]
-                ae0, ae1, ae2 = acc[tile, EMBEDDING], acc[tile, EMBEDDING + 1], acc[tile, EMBEDDING + 2]
-                ac, ad = acc[tile, CURVATURE_COLOUR], acc[tile, CURVATURE_DEPTH]
-                m, mx, my = acc[tile, ACC_H], acc[tile, ACC_X], acc[tile, ACC_Y]
-                mxx, mxy, myy = acc[tile, ACC_XX], acc[tile, ACC_XY], acc[tile, ACC_YY]
-                for j in ti.static(range(LANES)):
-                    dx, dy = dx0 + (j % CHUNK), dy0 + (j // CHUNK)
-                    raw = op * exp_neg((qa * dx + qb * dy) * dx + qc * dy * dy)
-                    alpha = ti.min(ALPHA_MAX, raw)
-                    alpha = ti.select(alpha > ALPHA_MIN, alpha, 0.0)
-                    w = T[j] * alpha
-                    gc = g0[j] * c0 + g1[j] * c1 + g2[j] * c2 + gd[j] * (z + zu * dx + zv * dy) + go[j]
+    for spread in range(tiles * SPREAD):
+        tile = spread // SPREAD
+        if spread - tile * SPREAD == 0:
+            for chunk in range(CHUNKS):
+                state[tile * CHUNKS + chunk, 0], state[tile * CHUNKS + chunk, 1] = Lanes(1.0), Lanes(0.0)
+            for k in range(start[tile], start[tile + 1]):
+                u, v, qa, qb, qc, op = slot[k, U], slot[k, V], slot[k, QA], slot[k, QB], slot[k, QC], slot[k, OPACITY]
+                z, zu, zv = slot[k, Z], slot[k, ZU], slot[k, ZV]
+                c0, c1, c2 = slot[k, RED], slot[k, RED + 1], slot[k, RED + 2]
+                for c in ti.static(range(SPLAT_GRAD)):
+                    acc[tile, c] = Lanes(0.0)
+                bits = mask[k]
+                while bits != 0:
+                    lowest = bits & (-bits)
+                    bits ^= lowest
+                    chunk = 31 - ti.math.clz(lowest)
+                    row = tile * CHUNKS + chunk
+                    dx0, dy0 = origin[chunk, 0] - u, origin[chunk, 1] - v
+                    T, A, total = state[row, 0], state[row, 1], g[row, G_TOTAL]
+                    g0, g1, g2, gd, go = g[row, 0], g[row, 1], g[row, 2], g[row, G_DEPTH], g[row, G_OPACITY]
+                    ge0, ge1, ge2 = g[row, G_EMBEDDING], g[row, G_EMBEDDING + 1], g[row, G_EMBEDDING + 2]
+                    wc, wd = g[row, W_COLOUR], g[row, W_DEPTH]
+                    a0, a1, a2 = acc[tile, RED], acc[tile, RED + 1], acc[tile, RED + 2]
+                    az, azu, azv = acc[tile, Z], acc[tile, ZU], acc[tile, ZV]
+                    ae0, ae1, ae2 = acc[tile, EMBEDDING], acc[tile, EMBEDDING + 1], acc[tile, EMBEDDING + 2]
+                    ac, ad = acc[tile, CURVATURE_COLOUR], acc[tile, CURVATURE_DEPTH]
+                    m, mx, my = acc[tile, ACC_H], acc[tile, ACC_X], acc[tile, ACC_Y]
+                    mxx, mxy, myy = acc[tile, ACC_XX], acc[tile, ACC_XY], acc[tile, ACC_YY]
+                    for j in ti.static(range(LANES)):
+                        dx, dy = dx0 + (j % CHUNK), dy0 + (j // CHUNK)
+                        raw = op * exp_neg((qa * dx + qb * dy) * dx + qc * dy * dy)
+                        alpha = ti.min(ALPHA_MAX, raw)
+                        alpha = ti.select(alpha > ALPHA_MIN, alpha, 0.0)
+                        w = T[j] * alpha
+                        gc = g0[j] * c0 + g1[j] * c1 + g2[j] * c2 + gd[j] * (z + zu * dx + zv * dy) + go[j]
+                        if ti.static(with_embedding):
+                            gc += ge0[j] * slot[k, EMBEDDING] + ge1[j] * slot[k, EMBEDDING + 1]
+                            gc += ge2[j] * slot[k, EMBEDDING + 2]
+                        prefix = A[j] + w * gc
+                        h = (T[j] * gc - (total[j] - prefix) / (1.0 - alpha)) * alpha
+                        h = ti.select(raw < ALPHA_MAX, h, 0.0)
+                        T[j] -= w
+                        A[j] = prefix
+                        a0[j] += w * g0[j]
+                        a1[j] += w * g1[j]
+                        a2[j] += w * g2[j]
+                        wg = w * gd[j]
+                        az[j] += wg
+                        azu[j] += wg * dx
+                        azv[j] += wg * dy
+                        if ti.static(with_embedding):
+                            ae0[j] += w * ge0[j]
+                            ae1[j] += w * ge1[j]
+                            ae2[j] += w * ge2[j]
+                        if ti.static(with_curvature):
+                            ac[j] += w * wc[j]
+                            ad[j] += w * wd[j]
+                        hx, hy = h * dx, h * dy
+                        m[j] += h
+                        mx[j] += hx
+                        my[j] += hy
+                        mxx[j] += hx * dx
+                        mxy[j] += hx * dy
+                        myy[j] += hy * dy
+                    state[row, 0], state[row, 1] = T, A
+                    acc[tile, RED], acc[tile, RED + 1], acc[tile, RED + 2] = a0, a1, a2
+                    acc[tile, Z], acc[tile, ZU], acc[tile, ZV] = az, azu, azv
                     if ti.static(with_embedding):
-                        gc += ge0[j] * slot[k, EMBEDDING] + ge1[j] * slot[k, EMBEDDING + 1]
-                        gc += ge2[j] * slot[k, EMBEDDING + 2]
-                    prefix = A[j] + w * gc
-                    h = (T[j] * gc - (total[j] - prefix) / (1.0 - alpha)) * alpha
-                    h = ti.select(raw < ALPHA_MAX, h, 0.0)
-                    T[j] -= w
-                    A[j] = prefix
-                    a0[j] += w * g0[j]
-                    a1[j] += w * g1[j]
-                    a2[j] += w * g2[j]
-                    wg = w * gd[j]
-                    az[j] += wg
-                    azu[j] += wg * dx
-                    azv[j] += wg * dy
-                    if ti.static(with_embedding):
-                        ae0[j] += w * ge0[j]
-                        ae1[j] += w * ge1[j]
-                        ae2[j] += w * ge2[j]
+                        acc[tile, EMBEDDING], acc[tile, EMBEDDING + 1], acc[tile, EMBEDDING + 2] = ae0, ae1, ae2
                     if ti.static(with_curvature):
-                        ac[j] += w * wc[j]
-                        ad[j] += w * wd[j]
-                    hx, hy = h * dx, h * dy
-                    m[j] += h
-                    mx[j] += hx
-                    my[j] += hy
-                    mxx[j] += hx * dx
-                    mxy[j] += hx * dy
-                    myy[j] += hy * dy
-                state[row, 0], state[row, 1] = T, A
-                acc[tile, RED], acc[tile, RED + 1], acc[tile, RED + 2] = a0, a1, a2
-                acc[tile, Z], acc[tile, ZU], acc[tile, ZV] = az, azu, azv
-                if ti.static(with_embedding):
-                    acc[tile, EMBEDDING], acc[tile, EMBEDDING + 1], acc[tile, EMBEDDING + 2] = ae0, ae1, ae2
-                if ti.static(with_curvature):
-                    acc[tile, CURVATURE_COLOUR], acc[tile, CURVATURE_DEPTH] = ac, ad
-                acc[tile, ACC_H], acc[tile, ACC_X], acc[tile, ACC_Y] = m, mx, my
-                acc[tile, ACC_XX], acc[tile, ACC_XY], acc[tile, ACC_YY] = mxx, mxy, myy
-            for c in ti.static((Z, ZU, ZV, RED, RED + 1, RED + 2)):
-                slot_grad[k, c] = acc[tile, c].sum()
-            for c in ti.static(range(3)):
-                slot_grad[k, EMBEDDING + c] = 0.0
-                if ti.static(with_embedding):
-                    slot_grad[k, EMBEDDING + c] = acc[tile, EMBEDDING + c].sum()
-            for c in ti.static((CURVATURE_COLOUR, CURVATURE_DEPTH)):
-                slot_grad[k, c] = 0.0
-                if ti.static(with_curvature):
+                        acc[tile, CURVATURE_COLOUR], acc[tile, CURVATURE_DEPTH] = ac, ad
+                    acc[tile, ACC_H], acc[tile, ACC_X], acc[tile, ACC_Y] = m, mx, my
+                    acc[tile, ACC_XX], acc[tile, ACC_XY], acc[tile, ACC_YY] = mxx, mxy, myy
+                for c in ti.static((Z, ZU, ZV, RED, RED + 1, RED + 2)):
                     slot_grad[k, c] = acc[tile, c].sum()
-            sx, sy, depth_sum = acc[tile, ACC_X].sum(), acc[tile, ACC_Y].sum(), slot_grad[k, Z]
-            slot_grad[k, OPACITY] = acc[tile, ACC_H].sum() / op
-            slot_grad[k, U] = 2.0 * qa * sx + qb * sy - zu * depth_sum
-            slot_grad[k, V] = qb * sx + 2.0 * qc * sy - zv * depth_sum
-            slot_grad[k, QA] = -acc[tile, ACC_XX].sum()
-            slot_grad[k, QB] = -acc[tile, ACC_XY].sum()
-            slot_grad[k, QC] = -acc[tile, ACC_YY].sum()
+                for c in ti.static(range(3)):
+                    slot_grad[k, EMBEDDING + c] = 0.0
+                    if ti.static(with_embedding):
+                        slot_grad[k, EMBEDDING + c] = acc[tile, EMBEDDING + c].sum()
+                for c in ti.static((CURVATURE_COLOUR, CURVATURE_DEPTH)):
+                    slot_grad[k, c] = 0.0
+                    if ti.static(with_curvature):
+                        slot_grad[k, c] = acc[tile, c].sum()
+                sx, sy, depth_sum = acc[tile, ACC_X].sum(), acc[tile, ACC_Y].sum(), slot_grad[k, Z]
+                slot_grad[k, OPACITY] = acc[tile, ACC_H].sum() / op
+                slot_grad[k, U] = 2.0 * qa * sx + qb * sy - zu * depth_sum
+                slot_grad[k, V] = qb * sx + 2.0 * qc * sy - zv * depth_sum
+                slot_grad[k, QA] = -acc[tile, ACC_XX].sum()
+                slot_grad[k, QB] = -acc[tile, ACC_XY].sum()
+                slot_grad[k, QC] = -acc[tile, ACC_YY].sum()
 
 
 @ti.kernel

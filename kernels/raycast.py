@@ -7,6 +7,7 @@ painted on another and wins over it.
 """
 
 import taichi as ti
+
 from tgslam.kernels.procedural import surface_colour
 
 QUAD, BOX, ELLIPSOID, CYLINDER = range(4)  # shapes

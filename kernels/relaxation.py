@@ -12,43 +12,6 @@ nd = ti.types.ndarray
 
 
 @ti.kernel
-def residual_weights(
-    colour: nd(ti.f32, ndim=3),  # [H, W, 3] rendered
-    depth: nd(ti.f32, ndim=2),  # [H, W] rendered, accumulated, m
-    opacity: nd(ti.f32, ndim=2),  # [H, W] rendered
-    observed_colour: nd(ti.f32, ndim=3),  # [H, W, 3]
-    observed_depth: nd(ti.f32, ndim=2),  # [H, W] m, 0 = none
-    gate: nd(ti.f32, ndim=2),  # [H, W] T of Eq. 11
-    gain: ti.f32,
-    bias: ti.f32,
-    epsilon_colour: ti.f32,
-    epsilon_depth: ti.f32,  # in sigmas
-    sigma_per_m2: ti.f32,
-    gate_depth_boost: ti.f32,
-    min_depth_opacity: ti.f32,
-    scale_colour: ti.f32,  # weight of the colour term, a pixel and channel
-    scale_depth: ti.f32,  # weight of the depth term, a pixel
-    w_colour: nd(ti.f32, ndim=2),  # [H, W] out
-    w_depth: nd(ti.f32, ndim=2),  # [H, W] out, 1/m^2
-):
-    """Second derivatives of the Charbonnier terms (Eqs. 12, 13) by a rendered channel, reweighted least squares."""
-    for y in range(w_colour.shape[0]):
-        for x in range(w_colour.shape[1]):
-            squares = 0.0
-            for c in ti.static(range(3)):
-                r = gain * colour[y, x, c] + bias - observed_colour[y, x, c]
-                squares += r * r
-            w_colour[y, x] = scale_colour * gain * gain / ti.sqrt(squares / 3.0 + epsilon_colour * epsilon_colour)
-            measured = observed_depth[y, x]
-            w_depth[y, x] = 0.0
-            if measured > 0.0 and opacity[y, x] > min_depth_opacity:
-                inv_sigma = 1.0 / (sigma_per_m2 * measured * measured)
-                e = (depth[y, x] / opacity[y, x] - measured) * inv_sigma
-                weight = scale_depth * (1.0 + gate_depth_boost * gate[y, x]) / ti.sqrt(e * e + epsilon_depth**2)
-                w_depth[y, x] = weight * (inv_sigma / opacity[y, x]) ** 2
-
-
-@ti.kernel
 def relax(
     count: ti.i32,
     tile_count: nd(ti.i32, ndim=1),  # [N] 0 = not rendered

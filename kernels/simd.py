@@ -9,6 +9,8 @@ PER_ROW = TILE // CHUNK
 CHUNKS = PER_ROW * PER_ROW
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.99
+SPREAD = 15  # a loop over tiles counts in steps of this, since Taichi hands a thread 512 iterations at a time; no power
+# of two, or LLVM turns `tile * 16 + chunk` into an `or` and no longer sees that lanes are contiguous
 T_MIN = 1e-4  # a chunk whose every pixel lets less than this through is finished
 
 Lanes = ti.types.vector(LANES, ti.f32)

@@ -160,7 +160,7 @@ def _field_values(hint: Any, field: dataclasses.Field[Any]) -> st.SearchStrategy
     if hint is int:
         return st.integers(low, high)
     if hint is float:
-        return st.floats(low, high, allow_nan=False, allow_infinity=False)
+        return st.floats(low, high, allow_nan=False, allow_infinity=False, allow_subnormal=False)
     if hint is str:
         return st.text(
             st.characters(codec="utf-8", exclude_characters="\r\x85\u2028\u2029", exclude_categories=("Cs", "Cc"))
@@ -169,9 +169,11 @@ def _field_values(hint: Any, field: dataclasses.Field[Any]) -> st.SearchStrategy
     elements = typing.get_args(hint)
     size = None if elements[-1] is Ellipsis else len(elements)
     element = (
-        st.floats(low, high, allow_nan=False, allow_infinity=False) if elements[0] is float else st.integers(low, high)
+        st.floats(low, high, allow_nan=False, allow_infinity=False, allow_subnormal=False)
+        if elements[0] is float
+        else st.integers(low, high)
     )
-    return st.lists(element, min_size=size or 0, max_size=size or 6).map(tuple)
+    return st.lists(element, min_size=size or field.metadata["min_items"], max_size=size or 6).map(tuple)
 
 
 def configs_of(cls: type) -> st.SearchStrategy[Any]:

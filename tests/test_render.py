@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tgslam.kernels.projection import BLUR
-from tgslam.kernels.simd import ALPHA_MIN, T_MIN
 
 from tests.reference.projection import NAMES, Parameters, parameters, project
 from tests.reference.rasterize import Derivatives, Images, decisions_at, render, undecided
 from tgslam.gaussian_map import GaussianMap, MapGradient
 from tgslam.geometry import se3_exp
+from tgslam.kernels.projection import BLUR
+from tgslam.kernels.simd import ALPHA_MIN, T_MIN
 from tgslam.render import MIN_OPACITY, ImageGradient, Rasterizer
 from tgslam.types import Camera, Gaussians
 

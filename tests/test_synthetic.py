@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from tgslam.kernels import procedural
 
 from tests.reference import raycast as reference
 from tgslam.config.loader import load
@@ -18,6 +17,7 @@ from tgslam.datasets.synthetic import SyntheticSource
 from tgslam.datasets.tum import open_tum
 from tgslam.errors import ConfigError
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, se3_log, transform_points
+from tgslam.kernels import procedural
 from tgslam.synthetic import corridor, sensor
 from tgslam.synthetic.raycast import Raycaster, camera_scene
 from tgslam.synthetic.scene import Lighting, Material, SceneBuilder

@@ -18,7 +18,7 @@ class DatasetError(TgslamError):
 
 
 class FrameError(TgslamError):
-    """One frame that cannot be used (truncated image, wrong size, no depth); the run skips it, counts it and goes on."""
+    """One frame that cannot be used (truncated image, wrong size, no depth); the run skips and counts it."""
 
 
 class DeviceError(TgslamError):

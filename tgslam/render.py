@@ -124,7 +124,8 @@ class Rasterizer:
         rasterize.pack_gradient(
             self._out, self.tiles_x, self.camera.height, self.camera.width, embedding, curvature,
             g.colour, g.depth, g.opacity, g.embedding if embedding else self._no_embedding,
-            g.colour_weight if curvature else self._no_weight, g.depth_weight if curvature else self._no_weight, self._g,
+            g.colour_weight if curvature else self._no_weight, g.depth_weight if curvature else self._no_weight,
+            self._g,
         )  # fmt: skip
         rasterize.backward(
             self.tiles, self._start, slots.slot, slots.mask, self._origin, self._g, embedding, curvature,

@@ -69,7 +69,7 @@ def empty(shape: tuple[int, ...], dtype: type = np.float32, *, lanes: bool = Fal
     """
     if device() is Device.CPU:
         return np.empty(shape, dtype)
-    element = {np.float32: ti.f32, np.int32: ti.i32}[dtype]
+    element = ti.f32 if dtype is np.float32 else ti.i32
     if lanes:
         return ti.ndarray(ti.types.vector(shape[-1], element), shape[:-1])
     return ti.ndarray(element, shape)
@@ -84,7 +84,7 @@ def zeros(shape: tuple[int, ...], dtype: type = np.float32, *, lanes: bool = Fal
 
 def to_device(array: ArrayLike, dtype: type = np.float32) -> np.ndarray:
     """A host array as a device array: no copy on the CPU if it is contiguous and of that dtype already."""
-    host = np.ascontiguousarray(array, dtype)
+    host: np.ndarray = np.ascontiguousarray(array, dtype)
     if device() is Device.CPU:
         return host
     result = empty(host.shape, dtype)

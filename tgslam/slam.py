@@ -18,8 +18,9 @@ from tgslam.geometry import inverse, orthonormalized
 from tgslam.keyframes import KeyframeSelector
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.mapper import Mapper
+from tgslam.tracking.exposure import Exposure
 from tgslam.tracking.motion import ConstantVelocity
-from tgslam.tracking.result import Exposure, TrackingResult
+from tgslam.tracking.result import TrackingResult
 from tgslam.tracking.solver import make_tracker, track_or_recover
 from tgslam.types import Camera, Frame, FrameReport, FrameStatus, Gaussians, Trajectory
 
@@ -99,7 +100,10 @@ class Slam:
     def _track(self, frame: Frame) -> TrackingResult:
         predicted = self.motion.predict(frame.timestamp_s)
         latest = self._posed[-1]
-        fallbacks = [latest.T_ck @ latest.keyframe.T_cw, *(k.T_cw for k in self.mapper.keyframes[: -_FALLBACKS - 1 : -1])]
+        fallbacks = [
+            latest.T_ck @ latest.keyframe.T_cw,
+            *(k.T_cw for k in self.mapper.keyframes[: -_FALLBACKS - 1 : -1]),
+        ]
         return track_or_recover(self.tracker, frame, self.mapper.gaussians, predicted, fallbacks, self.exposure)
 
     def _keyframe_cue(self, frame: Frame, result: TrackingResult) -> str:

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from tgslam.kernels.projection import BLUR, EDGE, NEAR_M
 
 from tgslam.geometry import matrix_from_quat_wxyz, transform_points
+from tgslam.kernels.projection import BLUR, EDGE, NEAR_M
 from tgslam.types import Camera, Gaussians
 
 Array = NDArray[np.float64]

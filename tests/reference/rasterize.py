@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from tgslam.kernels.simd import ALPHA_MAX, ALPHA_MIN
 
 from tests.reference.projection import Array, Parameters, Splats, project
 from tgslam.geometry import se3_exp
+from tgslam.kernels.simd import ALPHA_MAX, ALPHA_MIN
 from tgslam.types import Camera
 
 

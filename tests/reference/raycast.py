@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import map_coordinates
+
 from tgslam.kernels import procedural as kinds
 from tgslam.kernels.raycast import BOX, CYLINDER, ELLIPSOID, LAYER_LEAD, QUAD
 

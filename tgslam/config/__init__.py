@@ -1,1 +1,1 @@
-"""Configuration: frozen dataclasses with every default in code (`schema`); YAML files and `--set` only override (`loader`)."""
+"""Configuration: every default in code (`schema`); YAML files and `--set` only override (`loader`)."""

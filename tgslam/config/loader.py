@@ -217,6 +217,8 @@ def _checked(hint: Any, field: dataclasses.Field[Any], value: Any, where: str, k
     except (TypeError, OverflowError):
         raise ConfigError(f"{where}: `{key}` = {_short(shown)} must be {allowed}") from None
     low, high, choices = (field.metadata.get(name) for name in ("low", "high", "choices"))
+    if isinstance(result, tuple) and len(result) < field.metadata.get("min_items", 0):
+        raise ConfigError(f"{where}: `{key}` = {_short(shown)} is too short: it must be {allowed}")
     for item in result if isinstance(result, tuple) else (result,):
         if item is None:
             continue

@@ -7,9 +7,15 @@ from dataclasses import dataclass
 from typing import Any
 
 
-def setting(default: Any, low: float | None = None, high: float | None = None, choices: tuple[str, ...] = ()) -> Any:
-    """A dataclass field with its allowed range [low, high] or choices, which `loader` checks."""
-    metadata = {"low": low, "high": high, "choices": choices}
+def setting(
+    default: Any,
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+    min_items: int = 0,
+) -> Any:
+    """A dataclass field with its allowed range [low, high] or choices, which `loader` checks; of a list, of each item."""
+    metadata = {"low": low, "high": high, "choices": choices, "min_items": min_items}
     if isinstance(default, tuple):
         return dataclasses.field(default_factory=lambda: default, metadata=metadata)
     return dataclasses.field(default=default, metadata=metadata)
@@ -49,7 +55,9 @@ class LossConfig:
     """The adaptive RGB-depth objective, Eqs. 10-13."""
 
     gate_percentile: float = setting(95.0, 50.0, 100.0)  # G_max of Eq. 11 is this percentile of the gradient magnitude
-    gate_noise_floor: float = setting(0.01, 1e-6, 1.0)  # epsilon of Eq. 11, intensity per px: weaker gradients are noise
+    gate_noise_floor: float = setting(
+        0.01, 1e-6, 1.0
+    )  # epsilon of Eq. 11, intensity per px: weaker gradients are noise
     gate_depth_boost: float = setting(1.0, 0.0, 100.0)  # depth residuals are weighted by 1 + this * T
     min_depth_opacity: float = setting(0.5, 0.01, 1.0)  # rendered depth counts above this opacity
     charbonnier_colour: float = setting(0.02, 1e-6, 1.0)  # epsilon, intensity in [0, 1]
@@ -69,8 +77,8 @@ class TrackingConfig:
 
     solver: str = setting("gauss_newton", choices=("gauss_newton", "first_order"))
     finest_width_px: int = setting(400, 16, 4096)  # images are halved until they are at most this wide
-    levels: int = setting(3, 1, 6)  # of the image pyramid, each half the size of the one before
-    iterations: tuple[int, ...] = setting((4, 6, 8))  # Gauss-Newton steps at most, by level, fine to coarse
+    # Gauss-Newton steps at most, by level of the image pyramid, fine to coarse; each is half the size of the one before
+    iterations: tuple[int, ...] = setting((4, 6, 8), 1, 1000, min_items=1)
     renders: int = setting(1, 1, 5)  # the map is rendered this often at the latest estimate
     sigma_colour: float = setting(0.05, 1e-4, 1.0)  # intensity residual of weight 1
     sigma_gradient: float = setting(0.02, 1e-4, 1.0)  # gradient residual of weight 1, 1/px
@@ -78,9 +86,9 @@ class TrackingConfig:
     weight_colour: float = setting(0.1, 0.0, 100.0)
     weight_gradient: float = setting(0.1, 0.0, 100.0)
     max_distance_sigmas: float = setting(15.0, 1.0, 1000.0)  # depth residuals beyond are no match
-    exposure_prior: float = setting(1000.0, 0.0, 1e9)  # how strongly gain 1 and bias 0 are believed, in pixels
+    exposure: str = setting("gain", choices=("none", "gain", "gain_bias"))  # a frame's brightness against the map
     min_opacity: float = setting(0.8, 0.0, 1.0)  # model pixels less covered are not used
-    first_order_iterations: tuple[int, ...] = setting((20, 20))  # Adam steps by level, fine to coarse
+    first_order_iterations: tuple[int, ...] = setting((20, 20), 1, 1000, min_items=1)  # Adam steps, likewise
     first_order_rate: float = setting(0.001, 1e-6, 1.0)  # Adam step, rad and m
     lost_inlier_ratio: float = setting(0.3, 0.0, 1.0)  # fewer matched pixels with a residual below 3 sigma: lost
     lost_overlap: float = setting(0.1, 0.0, 1.0)  # fewer live pixels that meet the map: lost
@@ -100,8 +108,8 @@ class KeyframeConfig:
 class SeedingConfig:
     """Gaussians from RGB-D."""
 
-    largest_cell_px: int = setting(8, 1, 64)  # power of two times smallest_cell_px
-    smallest_cell_px: int = setting(2, 1, 64)
+    smallest_cell_px: int = setting(2, 1, 64)  # cells at edges, texture and off planes
+    cell_levels: int = setting(3, 1, 6)  # of the quadtree: the largest cell is 2^(levels - 1) times the smallest
     plain_colour_std: float = setting(0.015, 0.0, 1.0)  # a cell whose channels vary less has no texture
     planar_sigmas: float = setting(2.0, 0.0, 100.0)  # a cell whose plane residual is less, in sensor sigmas, is flat
     overlap: float = setting(0.6, 0.1, 3.0)  # standard deviation of a Gaussian in cell sizes
@@ -114,8 +122,8 @@ class MappingConfig:
     """Insertion, pruning and refinement of the map."""
 
     optimizer: str = setting("relaxation", choices=("relaxation", "adam"))  # how colours move; geometry moves by Adam
-    window: int = setting(8, 1, 1000)  # keyframes refined together
-    window_random: int = setting(2, 0, 1000)  # of them, drawn from all earlier keyframes
+    window: int = setting(6, 1, 1000)  # latest keyframes refined together
+    window_random: int = setting(2, 0, 1000)  # and with them so many, drawn from all earlier ones
     iterations: int = setting(12, 0, 10_000)  # views rendered and refined a keyframe
     final_iterations: int = setting(60, 0, 1_000_000)  # after the last frame, over all keyframes; 0 = off
     refine_poses: bool = setting(True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.tracking.result import Exposure
+from tgslam.tracking.exposure import Exposure
 from tgslam.types import Frame
 
 _DEPTH_UNIT_M = 0.0002  # TUM's and finer than any RGB-D sensor's: 16 bits reach 13.1 m

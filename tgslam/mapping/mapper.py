@@ -49,7 +49,7 @@ class Mapper:
         self._prune()
 
     def _insert(self, keyframe: Keyframe) -> None:
-        """Seed Gaussians where the map is open; where the sensor saw no depth either, at a depth guessed from around."""
+        """Seed Gaussians where the map is open; where no depth was measured, at a guessed one."""
         colour, measured_m = keyframe.colour(), keyframe.depth_m()
         wanted = self._unexplained(keyframe, measured_m)
         depth_m = filled(measured_m)
@@ -57,9 +57,7 @@ class Mapper:
         cells = quadtree(
             exposure.gain * colour + exposure.bias, depth_m, wanted, self.seeding, self.loss.depth_sigma_per_m2
         )
-        normals = images.normals(
-            runtime.to_device(depth_m), self.camera, sigma_per_m2=self.loss.depth_sigma_per_m2
-        )
+        normals = images.normals(runtime.to_device(depth_m), self.camera, sigma_per_m2=self.loss.depth_sigma_per_m2)
         born = len(self.keyframes) - 1
         new = seed(cells, runtime.to_host(normals), self.camera, keyframe.T_cw, born, self.seeding)
         self.gaussians.append(new)
@@ -107,7 +105,7 @@ class Mapper:
 
     def _schedule(self, iterations: int) -> list[Keyframe]:
         """The views to refine: the latest keyframes in turn, newest first, mixed with random earlier ones."""
-        recent = self.keyframes[-(self.config.window - self.config.window_random) :][::-1]
+        recent = self.keyframes[-self.config.window :][::-1]
         earlier = self.keyframes[: -len(recent)]
         count = min(self.config.window_random, len(earlier))
         drawn = [earlier[k] for k in self.rng.choice(len(earlier), count, replace=False)] if count else []
@@ -116,5 +114,5 @@ class Mapper:
 
     def _may_move(self, keyframe: Keyframe) -> bool:
         """The first keyframe holds the world frame; earlier ones outside the window are anchors."""
-        window = self.keyframes[-(self.config.window - self.config.window_random) :]
+        window = self.keyframes[-self.config.window :]
         return self.config.refine_poses and keyframe is not self.keyframes[0] and any(keyframe is k for k in window)

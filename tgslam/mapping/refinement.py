@@ -28,12 +28,15 @@ class Refiner:
     def __init__(self, camera: Camera, config: MappingConfig, loss: LossConfig) -> None:
         self.config, self.loss = config, loss
         self.rasterizer = Rasterizer(camera)
-        channels, rates = dict(_GEOMETRY), {
-            "mean": config.rate_mean_px / camera.fx,
-            "log_scale": config.rate_scale,
-            "quat_wxyz": config.rate_rotation,
-            "opacity_logit": config.rate_opacity,
-        }
+        channels, rates = (
+            dict(_GEOMETRY),
+            {
+                "mean": config.rate_mean_px / camera.fx,
+                "log_scale": config.rate_scale,
+                "quat_wxyz": config.rate_rotation,
+                "opacity_logit": config.rate_opacity,
+            },
+        )
         if config.optimizer == "adam":
             channels["colour"], rates["colour"] = 3, config.rate_colour
         self.adam = Adam(channels, rates)
@@ -41,8 +44,6 @@ class Refiner:
         self.views: NDArray[np.int32] = np.zeros(0, np.int32)  # [N] views rendered with the Gaussian in sight
         self._gradient = MapGradient.zeros(1)
         self._workspace = losses.Workspace(camera.height, camera.width)
-        self._w_colour = runtime.zeros((camera.height, camera.width))
-        self._w_depth = runtime.zeros((camera.height, camera.width))
         self._observations: OrderedDict[int, losses.Observation] = OrderedDict()
         self._pose_steps: dict[int, VectorAdam] = {}
 
@@ -69,19 +70,13 @@ class Refiner:
         pixels, depths = max(result.parts["pixels"], 1.0), max(result.parts["depths"], 1.0)
         scale_colour = self.loss.weight_pho * self.loss.weight_l1 / (3.0 * pixels)
         scale_depth = self.loss.weight_geo / depths
-        relaxation.residual_weights(
-            rendered.colour, rendered.depth, rendered.opacity, observation.colour, observation.depth_m, observation.gate,
-            gain, bias, self.loss.charbonnier_colour, self.loss.charbonnier_depth_sigmas, self.loss.depth_sigma_per_m2,
-            self.loss.gate_depth_boost, self.loss.min_depth_opacity, scale_colour, scale_depth,
-            self._w_colour, self._w_depth,
-        )  # fmt: skip
         if self._gradient.mean.shape[0] != gaussians.capacity:
             self._gradient = MapGradient.zeros(gaussians.capacity)
         else:
             self._gradient.clear()
         g = ImageGradient(
             result.g_colour, result.g_depth, result.g_opacity,
-            colour_weight=self._w_colour, depth_weight=self._w_depth,
+            colour_weight=result.w_colour, depth_weight=result.w_depth,
         )  # fmt: skip
         g_pose = self.rasterizer.backward(gaussians, g, self._gradient)
         self._update_map(gaussians, keyframe, scale_colour, scale_depth)
@@ -92,7 +87,7 @@ class Refiner:
 
     def _update_map(self, gaussians: GaussianMap, keyframe: Keyframe, scale_colour: float, scale_depth: float) -> None:
         n, gradient = gaussians.count, self._gradient
-        names = [name for name in self.adam.learning_rates]
+        names = list(self.adam.learning_rates)
         self.adam.step(
             {name: getattr(gaussians, name) for name in names},
             {name: getattr(gradient, name) for name in names},
@@ -116,6 +111,6 @@ class Refiner:
             colour, depth_m = runtime.to_device(keyframe.colour()), runtime.to_device(keyframe.depth_m())
             cached = losses.observe(colour, depth_m, self.loss)
         self._observations[keyframe.index] = cached
-        while len(self._observations) > self.config.window:
+        while len(self._observations) > self.config.window + self.config.window_random:
             self._observations.popitem(last=False)
         return cached

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ class Cells:
     colour: NDArray[np.float64]  # [N, 3]
 
 
-def _blocks(image: NDArray[np.floating], size: int) -> NDArray[np.floating]:
+def _blocks(image: NDArray[Any], size: int) -> NDArray[Any]:
     """[H, W, ...] -> [H // size, W // size, size * size, ...]; the remainder at the right and bottom is cut off."""
     rows, columns = image.shape[0] // size, image.shape[1] // size
     cut = image[: rows * size, : columns * size]
@@ -61,12 +62,12 @@ def quadtree(
     config: SeedingConfig,
     sigma_per_m2: float,
 ) -> Cells:
-    """Cells that cover the `wanted` pixels [H, W] with depth, from `largest_cell_px` down to `smallest_cell_px`.
+    """Cells that cover the `wanted` pixels [H, W] with depth, from the largest size down to `smallest_cell_px`.
 
     A cell counts as wanted if at least half of its pixels with depth are.
     """
     found: list[list[NDArray[np.floating]]] = []
-    size = config.largest_cell_px
+    size = config.smallest_cell_px * 2 ** (config.cell_levels - 1)
     open_cells = np.ones((-(-depth_m.shape[0] // size), -(-depth_m.shape[1] // size)), bool)
     padding = [(0, -depth_m.shape[0] % size), (0, -depth_m.shape[1] % size)]
     depth = np.pad(depth_m.astype(np.float64), padding)
@@ -121,7 +122,9 @@ def seed(
     across = np.cross(normal, towards)
     length = np.linalg.norm(across, axis=-1, keepdims=True)
     helper = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
-    across = np.where(length > 1e-3, across / np.maximum(length, 1e-12), helper / np.linalg.norm(helper, axis=-1, keepdims=True))
+    across = np.where(
+        length > 1e-3, across / np.maximum(length, 1e-12), helper / np.linalg.norm(helper, axis=-1, keepdims=True)
+    )
     along = np.cross(normal, across)
     footprint = config.overlap * cells.size_px * cells.depth_m / camera.fx
     scale = np.stack([footprint, footprint / cosine, config.thickness * footprint], -1)

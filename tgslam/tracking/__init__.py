@@ -1,1 +1,1 @@
-"""Tracking: the pose of a frame against the map, by Gauss-Newton alignment or through the rasterizer's pose gradient."""
+"""Tracking: a frame's pose against the map, by Gauss-Newton alignment or by the rasterizer's pose gradient."""

@@ -10,9 +10,10 @@ from tgslam.config.schema import LossConfig, TrackingConfig
 from tgslam.gaussian_map import GaussianMap, MapGradient
 from tgslam.geometry import se3_exp
 from tgslam.render import ImageGradient, Rasterizer
+from tgslam.tracking.exposure import Exposure
 from tgslam.tracking.gauss_newton import GaussNewtonTracker
 from tgslam.tracking.pyramid import finest_level
-from tgslam.tracking.result import Exposure, TrackingResult
+from tgslam.tracking.result import TrackingResult
 from tgslam.types import Camera, Frame
 from tgslam.vector_adam import VectorAdam
 

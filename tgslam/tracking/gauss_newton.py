@@ -13,12 +13,14 @@ from tgslam.gaussian_map import GaussianMap
 from tgslam.geometry import adjoint, inverse, se3_exp
 from tgslam.kernels import alignment
 from tgslam.render import Rasterizer
+from tgslam.tracking.exposure import Exposure, IntensityMoments, fit_exposure
 from tgslam.tracking.lost import evidence_against
 from tgslam.tracking.pyramid import LiveLevel, ModelLevel, finest_level, live_pyramid, model_pyramid
-from tgslam.tracking.result import Exposure, TrackingResult
+from tgslam.tracking.result import TrackingResult
 from tgslam.types import Camera, Frame
 
 _CONVERGED = 1e-5  # rad and m: a smaller step ends a level
+_DAMPING = 1e-6  # of the normal matrix's trace
 _UPPER = np.triu_indices(alignment.UNKNOWNS)
 
 
@@ -26,14 +28,15 @@ _UPPER = np.triu_indices(alignment.UNKNOWNS)
 class NormalEquations:
     """J^T W J, J^T W r and the statistics of one evaluation."""
 
-    A: NDArray[np.float64]  # [8, 8]
-    b: NDArray[np.float64]  # [8]
-    live_pixels: float
+    A: NDArray[np.float64]  # [6, 6]
+    b: NDArray[np.float64]  # [6]
+    live_pixels: int
     candidates: float  # live pixels that meet a model pixel
     matched: float  # of them, with depths that agree roughly
     inliers: float  # of them, within three sigma
     depth_residual: float  # mean, in sigmas
     colour_residual: float  # mean, in intensity
+    intensity: IntensityMoments
 
 
 class GaussNewtonTracker:
@@ -45,16 +48,20 @@ class GaussNewtonTracker:
         self.camera = camera
         self.rasterizer = Rasterizer(camera.halved(self.first))
 
-    def track(self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure) -> TrackingResult:
+    def track(
+        self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure
+    ) -> TrackingResult:
         """Pose of `frame` from the prediction T_cw [4, 4] and the last frame's exposure."""
-        live = live_pyramid(frame, self.camera, self.first, self.config.levels, self.loss.gate_percentile)
+        live = live_pyramid(frame, self.camera, self.first, len(self.config.iterations), self.loss.gate_percentile)
         for _ in range(self.config.renders):
             model = self._model(gaussians, T_cw)
             T_ml, exposure, last = self._align(live, model, exposure)
             T_cw = inverse(T_ml) @ T_cw
         return self._result(T_cw, T_ml, exposure, last)
 
-    def assess(self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure) -> TrackingResult:
+    def assess(
+        self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure
+    ) -> TrackingResult:
         """What the frame says of a pose that another solver found; the pose stays as it is."""
         live = live_pyramid(frame, self.camera, self.first, 1, self.loss.gate_percentile)
         equations = self._linearise(live[0], self._model(gaussians, T_cw)[0], np.eye(4), exposure)
@@ -63,7 +70,7 @@ class GaussNewtonTracker:
     def _result(
         self, T_cw: NDArray[np.float64], T_ml: NDArray[np.float64], exposure: Exposure, last: NormalEquations
     ) -> TrackingResult:
-        information = adjoint(T_ml).T @ last.A[:6, :6] @ adjoint(T_ml)
+        information = adjoint(T_ml).T @ last.A @ adjoint(T_ml)
         measures = {
             "inlier_ratio": last.inliers / max(last.matched, 1.0),
             "overlap": last.matched / max(last.live_pixels, 1.0),
@@ -83,9 +90,9 @@ class GaussNewtonTracker:
         covered = opacity > self.config.min_opacity
         safe = np.maximum(opacity, self.config.min_opacity)
         depth = np.where(covered, runtime.to_host(rendered.depth) / safe, np.float32(0.0))
-        grey = runtime.to_host(images.luminance(rendered.colour)) / safe
+        grey = images.luminance(rendered.colour)  # not divided: the map's colours are fitted to be seen over black
         return model_pyramid(
-            runtime.to_device(grey), runtime.to_device(depth), self.rasterizer.camera, self.config.levels,
+            grey, runtime.to_device(depth), self.rasterizer.camera, len(self.config.iterations),
             self.loss.depth_sigma_per_m2,
         )  # fmt: skip
 
@@ -97,24 +104,18 @@ class GaussNewtonTracker:
         for level in reversed(range(len(live))):
             for _ in range(self.config.iterations[level]):
                 equations = self._linearise(live[level], model[level], T_ml, exposure)
-                step = self._solve(equations, exposure)
-                T_ml = se3_exp(step[:6]) @ T_ml
-                exposure = Exposure(exposure.gain + step[6], exposure.bias + step[7])
-                if np.abs(step[:6]).max() < _CONVERGED:
+                exposure = fit_exposure(equations.intensity, self.config.exposure, exposure)
+                # a weak damping holds the directions that nothing observes
+                damping = _DAMPING * np.trace(equations.A) + 1e-9
+                step = np.linalg.solve(equations.A + damping * np.eye(6), -equations.b)
+                T_ml = se3_exp(step) @ T_ml
+                if np.abs(step).max() < _CONVERGED:
                     break
         return T_ml, exposure, equations
 
-    def _solve(self, equations: NormalEquations, exposure: Exposure) -> NDArray[np.float64]:
-        """The step [8]; gain and bias are held near (1, 0) by a prior, directions without evidence by a weak damping."""
-        A, b = equations.A.copy(), equations.b.copy()
-        A[6, 6] += self.config.exposure_prior
-        A[7, 7] += self.config.exposure_prior
-        b[6] += self.config.exposure_prior * (exposure.gain - 1.0)
-        b[7] += self.config.exposure_prior * exposure.bias
-        A[np.diag_indices(6)] += 1e-6 * np.trace(A[:6, :6]) + 1e-9
-        return np.linalg.solve(A, -b)
-
-    def _linearise(self, live: LiveLevel, model: ModelLevel, T_ml: NDArray[np.float64], exposure: Exposure) -> NormalEquations:
+    def _linearise(
+        self, live: LiveLevel, model: ModelLevel, T_ml: NDArray[np.float64], exposure: Exposure
+    ) -> NormalEquations:
         config, camera = self.config, live.camera
         settings = np.zeros(alignment.SETTINGS, np.float32)
         settings[[alignment.FX, alignment.FY, alignment.CX, alignment.CY]] = camera.fx, camera.fy, camera.cx, camera.cy
@@ -122,29 +123,30 @@ class GaussNewtonTracker:
         settings[alignment.DEPTH_SIGMA] = self.loss.depth_sigma_per_m2
         settings[alignment.MAX_DISTANCE_SIGMAS] = config.max_distance_sigmas
         settings[alignment.CHARBONNIER_DEPTH] = self.loss.charbonnier_depth_sigmas
-        settings[alignment.SIGMA_COLOUR], settings[alignment.SIGMA_GRADIENT] = config.sigma_colour, config.sigma_gradient
+        settings[alignment.GATE_DEPTH_BOOST] = self.loss.gate_depth_boost
+        settings[[alignment.SIGMA_COLOUR, alignment.SIGMA_GRADIENT]] = config.sigma_colour, config.sigma_gradient
         settings[alignment.WEIGHT_DEPTH] = config.weight_depth
         settings[alignment.WEIGHT_COLOUR] = config.weight_colour
         settings[alignment.WEIGHT_GRADIENT] = config.weight_gradient
-        partial = runtime.empty((camera.height, alignment.PARTIAL))
+        partial = runtime.empty((camera.height * alignment.SPLIT, alignment.PARTIAL))
         alignment.normal_equations(
-            runtime.to_device(settings), runtime.to_device(T_ml[:3].reshape(12)), 1,
+            runtime.to_device(settings), runtime.to_device(T_ml[:3].reshape(12)),
             live.depth, live.grey, live.grad_x, live.grad_y, live.gate,
-            model.depth, model.normal, model.grey, model.grad_x, model.grad_y, model.grad_xx, model.grad_xy, model.grad_yy,
-            partial,
+            model.depth, model.normal, model.grey, model.grad_x, model.grad_y,
+            model.grad_xx, model.grad_xy, model.grad_yy, partial,
         )  # fmt: skip
         sums = runtime.to_host(partial).sum(0, dtype=np.float64)
         A = np.zeros((alignment.UNKNOWNS, alignment.UNKNOWNS))
         A[_UPPER] = sums[: alignment.TRIANGLE]
-        A = A + np.triu(A, 1).T
-        matched = sums[alignment.MATCHED]
+        matched = max(sums[alignment.MATCHED], 1.0)
         return NormalEquations(
-            A=A,
+            A=A + np.triu(A, 1).T,
             b=sums[alignment.RHS : alignment.RHS + alignment.UNKNOWNS],
-            live_pixels=float((runtime.to_host(live.depth) > 0).sum()),
-            candidates=sums[alignment.CANDIDATES],
-            matched=matched,
-            inliers=sums[alignment.INLIERS],
-            depth_residual=sums[alignment.DEPTH_SUM] / max(matched, 1.0),
-            colour_residual=sums[alignment.COLOUR_SUM] / max(sums[alignment.COLOUR_COUNT], 1.0) * config.sigma_colour,
+            live_pixels=int(np.count_nonzero(runtime.to_host(live.depth))),
+            candidates=float(sums[alignment.CANDIDATES]),
+            matched=float(sums[alignment.MATCHED]),
+            inliers=float(sums[alignment.INLIERS]),
+            depth_residual=float(sums[alignment.DEPTH_SUM] / matched),
+            colour_residual=float(sums[alignment.COLOUR_SUM] / matched * config.sigma_colour),
+            intensity=IntensityMoments(*(float(m) for m in sums[alignment.W : alignment.W_LM + 1])),
         )

@@ -1,4 +1,4 @@
-"""What alignment needs of an image pair, from fine to coarse, once for the live frame and once for the rendered model."""
+"""What alignment needs of an image pair, fine to coarse: for the live frame and for the rendered model."""
 
 from __future__ import annotations
 

@@ -7,13 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-
-@dataclass(frozen=True)
-class Exposure:
-    """Brightness of a frame relative to the map: map = gain * frame + bias."""
-
-    gain: float = 1.0
-    bias: float = 0.0
+from tgslam.tracking.exposure import Exposure
 
 
 @dataclass(frozen=True)

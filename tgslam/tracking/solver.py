@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from tgslam.config.schema import LossConfig, TrackingConfig
 from tgslam.gaussian_map import GaussianMap
 from tgslam.render import Rasterizer
+from tgslam.tracking.exposure import Exposure
 from tgslam.tracking.first_order import FirstOrderTracker
 from tgslam.tracking.gauss_newton import GaussNewtonTracker
-from tgslam.tracking.result import Exposure, TrackingResult
+from tgslam.tracking.result import TrackingResult
 from tgslam.types import Camera, Frame
 
 
