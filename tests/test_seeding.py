@@ -1,0 +1,256 @@
+"""Seeding: which cells of a frame become Gaussians, and whether those lie on the surfaces and look like the frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from tgslam import images
+from tgslam.config.schema import SeedingConfig, SyntheticConfig
+from tgslam.datasets.synthetic import SyntheticSource
+from tgslam.evaluation.images import masked_psnr
+from tgslam.geometry import inverse, matrix_from_quat_wxyz, se3_exp, transform_points
+from tgslam.mapping.seeding import Cells, quadtree, seed
+from tgslam.render import Rasterizer
+from tgslam.types import Camera, Frame, Gaussians
+
+SIGMA = 0.0015
+CONFIG = SeedingConfig()
+LARGEST = CONFIG.smallest_cell_px * 2 ** (CONFIG.cell_levels - 1)
+CAMERA = Camera(96, 72, 80.0, 80.0, 47.5, 35.5)
+
+
+def everywhere(depth_m: NDArray) -> NDArray[np.bool_]:
+    return np.ones(depth_m.shape, bool)
+
+
+def plane_depth(tilt_rad: float, camera: Camera = CAMERA, distance_m: float = 2.0) -> NDArray[np.float64]:
+    """Depth of a plane ahead, turned by `tilt_rad` about the image's y axis."""
+    x = (np.arange(camera.width) - camera.cx) / camera.fx
+    row = distance_m * np.cos(tilt_rad) / (x * np.sin(tilt_rad) + np.cos(tilt_rad))
+    return np.tile(row, (camera.height, 1))
+
+
+def plane_normal(tilt_rad: float) -> NDArray[np.float64]:
+    """The normal of `plane_depth`, towards the camera."""
+    return np.array([-np.sin(tilt_rad), 0.0, -np.cos(tilt_rad)])
+
+
+def grey(depth_m: NDArray) -> NDArray[np.float64]:
+    return np.full((*depth_m.shape, 3), 0.5)
+
+
+def squares(cells: Cells) -> list[tuple[slice, slice]]:
+    """The pixels of each cell. Its centre is a mean of pixels inside it, which tells where the square begins."""
+    size = cells.size_px.astype(int)
+    left, top = (cells.u // size).astype(int) * size, (cells.v // size).astype(int) * size
+    return [(slice(y, y + s), slice(x, x + s)) for x, y, s in zip(left, top, size, strict=True)]
+
+
+def times_covered(cells: Cells, shape: tuple[int, int]) -> NDArray[np.int_]:
+    count = np.zeros(shape, int)
+    for square in squares(cells):
+        count[square] += 1
+    return count
+
+
+@st.composite
+def patchy_frames(draw: st.DrawFn) -> tuple[NDArray, NDArray, NDArray]:
+    """Colour, depth and wanted mask with plain areas, texture, steps and holes, of any size."""
+    height, width = draw(st.integers(3, 29)), draw(st.integers(3, 29))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+
+    def patches(values: list[float]) -> NDArray:
+        coarse = rng.choice(values, (-(-height // 6), -(-width // 6)))
+        return np.repeat(np.repeat(coarse, 6, 0), 6, 1)[:height, :width]
+
+    depth_m = patches([1.0, 2.0, 2.0, 2.0])
+    depth_m[rng.random(depth_m.shape) < draw(st.sampled_from([0.0, 0.02, 0.5, 1.0]))] = 0.0
+    texture = patches([0.0, 0.0, 0.3])[..., None] * rng.random((height, width, 3))
+    wanted = patches([0.0, 1.0]) + (rng.random(depth_m.shape) < draw(st.sampled_from([0.0, 0.3]))) > 0
+    return 0.5 + texture, depth_m, wanted
+
+
+@settings(max_examples=150, deadline=None)
+@given(patchy_frames(), st.integers(1, 3), st.integers(1, 4))
+def test_every_pixel_with_depth_is_covered_once(frame: tuple, smallest: int, levels: int) -> None:
+    colour, depth_m, _ = frame
+    config = SeedingConfig(smallest_cell_px=smallest, cell_levels=levels)
+    cells = quadtree(colour, depth_m, everywhere(depth_m), config, SIGMA)
+    count = times_covered(cells, depth_m.shape)
+    assert (count[depth_m > 0] == 1).all()
+    assert count.max(initial=0) <= 1
+    assert all((depth_m[square] > 0).any() for square in squares(cells))
+
+
+@settings(max_examples=150, deadline=None)
+@given(patchy_frames())
+def test_wanted_cells_are_those_of_the_whole_frame_that_are_wanted_by_half(frame: tuple) -> None:
+    colour, depth_m, wanted = frame
+    every = squares(quadtree(colour, depth_m, everywhere(depth_m), CONFIG, SIGMA))
+    share = [wanted[square][depth_m[square] > 0].mean() for square in every]
+    chosen = squares(quadtree(colour, depth_m, wanted, CONFIG, SIGMA))
+    assert chosen == [square for square, part in zip(every, share, strict=True) if part >= 0.5]
+
+
+def test_nothing_wanted_or_no_depth_gives_no_cell() -> None:
+    depth_m = plane_depth(0.0)
+    assert len(quadtree(grey(depth_m), depth_m, ~everywhere(depth_m), CONFIG, SIGMA).u) == 0
+    empty = quadtree(grey(depth_m), 0 * depth_m, everywhere(depth_m), CONFIG, SIGMA)
+    normals = np.zeros((*depth_m.shape, 3))
+    assert len(empty.u) == len(seed(empty, normals, CAMERA, np.eye(4), 0, CONFIG)) == 0
+
+
+@pytest.mark.parametrize("tilt_rad", [0.0, 0.5, 0.9])
+def test_a_plain_plane_gives_the_largest_cells(tilt_rad: float) -> None:
+    depth_m = plane_depth(tilt_rad)
+    cells = quadtree(grey(depth_m), depth_m, everywhere(depth_m), CONFIG, SIGMA)
+    assert (cells.size_px == LARGEST).all()
+    # The mean of inverse depths is the plane's depth at the centre, which lies between pixels
+    x = (cells.u - CAMERA.cx) / CAMERA.fx
+    exact_m = 2.0 * np.cos(tilt_rad) / (x * np.sin(tilt_rad) + np.cos(tilt_rad))
+    np.testing.assert_allclose(cells.depth_m, exact_m, rtol=1e-9)
+
+
+def test_the_sensors_noise_does_not_break_a_plane_up_and_twice_the_limit_does() -> None:
+    depth_m, rng = plane_depth(0.4), np.random.default_rng(0)
+    noise_m = SIGMA * depth_m**2 * rng.standard_normal(depth_m.shape)
+    noisy = quadtree(grey(depth_m), depth_m + noise_m, everywhere(depth_m), CONFIG, SIGMA)
+    assert (noisy.size_px == LARGEST).mean() > 0.99
+    rough = depth_m + 2 * CONFIG.planar_sigmas * noise_m
+    assert (quadtree(grey(depth_m), rough, everywhere(depth_m), CONFIG, SIGMA).size_px < LARGEST).mean() > 0.99
+
+
+@pytest.mark.parametrize("what", ["texture", "step", "hole"])
+def test_cells_are_small_at_texture_steps_and_holes_and_large_elsewhere(what: str) -> None:
+    depth_m = plane_depth(0.0)
+    colour = grey(depth_m)
+    busy = np.zeros(depth_m.shape, bool)
+    if what == "texture":
+        busy[20:31, 30:50] = True
+        colour[busy] += 0.2 * ((np.indices(depth_m.shape).sum(0) % 2)[busy])[:, None]
+    elif what == "step":
+        depth_m[:, 43:] = 1.5
+        busy[:, 42:44] = True
+    else:
+        depth_m[30:33, 40:45] = 0.0
+        busy[29:34, 39:46] = True
+    cells = quadtree(colour, depth_m, everywhere(depth_m), CONFIG, SIGMA)
+    for square, size in zip(squares(cells), cells.size_px, strict=True):
+        if size > CONFIG.smallest_cell_px:
+            assert (depth_m[square] > 0).all()
+            assert np.ptp(depth_m[square]) == 0
+            assert np.ptp(colour[square]) == 0
+        top, left = (axis.start // LARGEST * LARGEST for axis in square)
+        if not busy[top : top + LARGEST, left : left + LARGEST].any():
+            assert size == LARGEST
+
+
+@pytest.mark.parametrize("tilt_deg", [0, 30, 60, 72])
+def test_a_gaussian_is_as_wide_as_its_cell_in_the_image(tilt_deg: int) -> None:
+    tilt_rad = np.deg2rad(tilt_deg)
+    new, cells = seeded_plane(tilt_rad)
+    spread_px = np.sqrt(np.linalg.eigvalsh(projected_covariance(new, CAMERA)))
+    relative = spread_px / (CONFIG.overlap * cells.size_px[:, None])
+    towards = -new.mean / np.linalg.norm(new.mean, axis=1, keepdims=True)
+    not_grazing = towards @ plane_normal(tilt_rad) > 0.26
+    assert not_grazing.sum() > 40
+    assert relative[not_grazing].min() > 0.8
+    assert relative[not_grazing].max() < 1.3
+    near_centre = np.hypot(cells.u - CAMERA.cx, cells.v - CAMERA.cy) < 12
+    np.testing.assert_allclose(relative[near_centre], 1.0, atol=0.12)
+
+
+def test_a_surface_seen_at_grazing_angle_gives_no_needles() -> None:
+    new, _ = seeded_plane(np.deg2rad(84.0))
+    width = np.exp(new.log_scale[:, :2])
+    assert (width.max(1) / width.min(1) < 4.01).all()
+    assert (width.max(1) / width.min(1)).max() > 3.9
+
+
+def seeded_plane(tilt_rad: float) -> tuple[Gaussians, Cells]:
+    depth_m = plane_depth(tilt_rad)
+    cells = quadtree(grey(depth_m), depth_m, everywhere(depth_m) & (depth_m > 0) & (depth_m < 9), CONFIG, SIGMA)
+    normals = np.tile(plane_normal(tilt_rad), (*depth_m.shape, 1))
+    return seed(cells, normals, CAMERA, np.eye(4), 0, CONFIG), cells
+
+
+def projected_covariance(gaussians: Gaussians, camera: Camera) -> NDArray[np.float64]:
+    """[N, 2, 2] px^2, by the projection's derivative at each centre; the camera is the world frame."""
+    R = matrix_from_quat_wxyz(gaussians.quat_wxyz)
+    S = np.exp(gaussians.log_scale.astype(np.float64))[:, :, None] * np.swapaxes(R, 1, 2)
+    x, y, z = gaussians.mean.astype(np.float64).T
+    J = np.zeros((len(gaussians), 2, 3))
+    J[:, 0, 0], J[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
+    J[:, 1, 1], J[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
+    half = J @ np.swapaxes(S, 1, 2)
+    return half @ np.swapaxes(half, 1, 2)
+
+
+def test_without_a_normal_gaussians_face_the_camera() -> None:
+    depth_m = plane_depth(0.0)
+    cells = quadtree(grey(depth_m), depth_m, everywhere(depth_m), CONFIG, SIGMA)
+    new = seed(cells, np.zeros((*depth_m.shape, 3)), CAMERA, np.eye(4), 0, CONFIG)
+    thin = matrix_from_quat_wxyz(new.quat_wxyz)[:, :, 2]
+    towards = -new.mean / np.linalg.norm(new.mean, axis=1, keepdims=True)
+    np.testing.assert_allclose(np.abs((thin * towards).sum(1)), 1.0, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def source() -> SyntheticSource:
+    return SyntheticSource(SyntheticConfig(scene="room", width=161, height=118, frames=720), seed=0)
+
+
+def seeded_frame(source: SyntheticSource, frame: Frame, T_cw: NDArray) -> tuple[Gaussians, Cells]:
+    cells = quadtree(frame.colour, frame.depth_m, everywhere(frame.depth_m), CONFIG, SIGMA)
+    normals = images.normals(frame.depth_m, source.camera, sigma_per_m2=SIGMA)
+    return seed(cells, normals, source.camera, T_cw, 7, CONFIG), cells
+
+
+@pytest.mark.parametrize("index", [0, 300])
+def test_gaussians_lie_flat_on_the_true_surfaces(source: SyntheticSource, index: int) -> None:
+    T_cw = inverse(source.pose(index))
+    new, cells = seeded_frame(source, source.clean(index), T_cw)
+    label = source.labels(index)
+    # Cells that see one plane only, and so do the 14x14 pixels that their normals come from
+    labels = [label[max(y.start - 8, 0) : y.stop + 8, max(x.start - 8, 0) : x.stop + 8] for y, x in squares(cells)]
+    inside = np.array([np.ptp(around) == 0 and around.min() >= 0 for around in labels])
+    assert inside.sum() > 1000
+    plane = source.planes()[[around.flat[0] for around in labels]][inside]
+    distance_m = (plane[:, :3] * new.mean[inside]).sum(1) + plane[:, 3]
+    assert np.abs(distance_m).max() < 1e-5
+    thin = matrix_from_quat_wxyz(new.quat_wxyz[inside])[:, :, 2]
+    assert np.abs((thin * plane[:, :3]).sum(1)).min() > np.cos(np.deg2rad(0.05))
+    scale = np.exp(new.log_scale)
+    np.testing.assert_allclose(scale[:, 2], CONFIG.thickness * scale[:, :2].min(1), rtol=1e-4)
+    assert (new.birth_keyframe == 7).all()
+
+
+@pytest.mark.parametrize(("index", "noise"), [(0, False), (0, True), (300, True)])
+def test_a_seeded_frame_looks_like_the_frame(source: SyntheticSource, index: int, noise: bool) -> None:
+    frame = source.read(index) if noise else source.clean(index)
+    T_cw = se3_exp([0.2, -0.4, 0.1, 1.0, 2.0, -0.5])  # the world frame is of no concern
+    new, _ = seeded_frame(source, frame, T_cw)
+    rendering = Rasterizer(source.camera).render(new, T_cw)
+    measured = frame.depth_m > 0
+    assert (rendering.opacity[measured] > 0.9).mean() > 0.96
+    assert rendering.opacity[measured].min() > 0.6
+    assert masked_psnr(rendering.colour, frame.colour, measured) > 25.0
+    both = measured & (rendering.depth_m > 0)
+    exact_m = source.clean(index).depth_m
+    error_sigmas = np.abs(rendering.depth_m - exact_m)[both] / (SIGMA * exact_m[both] ** 2)
+    assert np.median(error_sigmas) < 0.8
+
+
+def test_means_are_in_the_world_frame() -> None:
+    depth_m = plane_depth(0.0)
+    cells = quadtree(grey(depth_m), depth_m, everywhere(depth_m), CONFIG, SIGMA)
+    normals = np.tile(plane_normal(0.0), (*depth_m.shape, 1))
+    T_cw = se3_exp([0.3, -0.2, 0.5, 0.4, -1.0, 2.0])
+    here, there = (seed(cells, normals, CAMERA, T, 0, CONFIG) for T in (np.eye(4), T_cw))
+    np.testing.assert_allclose(transform_points(T_cw, there.mean), here.mean, atol=1e-5)
+    thin = T_cw[:3, :3] @ matrix_from_quat_wxyz(there.quat_wxyz)[:, :, 2:]
+    np.testing.assert_allclose(np.abs(thin[:, 2, 0]), 1.0, atol=1e-5)
