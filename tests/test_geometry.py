@@ -123,3 +123,37 @@ def test_halved_camera_sees_the_averaged_pixels(width: int, height: int, times: 
     v, u = np.mgrid[0 : half.height, 0 : half.width].astype(np.float64)
     expected = np.stack([(u - half.cx) / half.fx, (v - half.cy) / half.fy], -1)
     np.testing.assert_allclose(rays, expected, atol=1e-9)
+
+
+@given(twists(), twists())
+def test_adjoint_carries_a_twist_through_a_transform(frame: np.ndarray, xi: np.ndarray) -> None:
+    T = geometry.se3_exp(frame)
+    small = 0.1 * xi  # so that rounding of the products stays far below the tolerance
+    expected = T @ geometry.se3_exp(small) @ geometry.inverse(T)
+    np.testing.assert_allclose(geometry.se3_exp(geometry.adjoint(T) @ small), expected, atol=1e-9)
+
+
+@given(twists(), twists())
+def test_adjoints_multiply_and_invert_like_their_transforms(first: np.ndarray, second: np.ndarray) -> None:
+    one, other = geometry.se3_exp(first), geometry.se3_exp(second)
+    both = geometry.adjoint(one) @ geometry.adjoint(other)
+    np.testing.assert_allclose(geometry.adjoint(one @ other), both, atol=1e-11)
+    back = geometry.adjoint(geometry.inverse(one)) @ geometry.adjoint(one)
+    np.testing.assert_allclose(back, np.eye(6), atol=1e-11)
+
+
+@given(st.lists(twists(), min_size=1, max_size=6))
+def test_many_quaternions_are_those_of_one_at_a_time(xis: list[np.ndarray]) -> None:
+    R = np.stack([geometry.so3_exp(xi[:3]) for xi in xis])
+    many = geometry.quat_wxyz_from_matrices(R)
+    np.testing.assert_array_equal(many, [geometry.quat_wxyz_from_matrix(one) for one in R])
+    np.testing.assert_allclose(np.linalg.norm(many, axis=1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(geometry.matrix_from_quat_wxyz(many), R, atol=1e-12)
+    assert (many[:, 0] >= 0).all()
+
+
+def test_quaternions_of_half_turns_and_of_no_matrices() -> None:
+    """Each of the four components is once the largest: every branch of Shepperd's method."""
+    R = np.stack([np.eye(3), *(np.diag(2.0 * axis - 1.0) for axis in np.eye(3))])
+    np.testing.assert_allclose(geometry.quat_wxyz_from_matrices(R), np.eye(4), atol=0)
+    assert geometry.quat_wxyz_from_matrices(np.zeros((0, 3, 3))).shape == (0, 4)

@@ -43,7 +43,7 @@ def _push_pull(value: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArr
     """Weighted means of ever coarser images fill what has no weight; value is 0 where weight is."""
     height, width = value.shape
     if min(height, width) <= 1:
-        return np.full_like(value, value.sum() / max(float(weight.sum()), 1e-12))
+        return np.full_like(value, (weight * value).sum() / max(float(weight.sum()), 1e-12))
     size = ((width + 1) // 2, (height + 1) // 2)
     total = cv2.resize(value * weight, size, interpolation=cv2.INTER_AREA)
     share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)

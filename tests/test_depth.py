@@ -1,0 +1,130 @@
+"""Flying pixels and holes of depth images."""
+
+import numpy as np
+import pytest
+
+from tests.reference import depth as reference
+from tgslam import depth, runtime
+from tgslam.kernels import depth as kernels
+
+SIGMA = 0.0015
+
+
+def keep_supported(depth_m, *settings):
+    kept = runtime.empty(depth_m.shape)
+    kernels.keep_supported(runtime.to_device(depth_m), *settings, kept)
+    return runtime.to_host(kept)
+
+
+def ragged(height, width, seed=0):
+    """Two surfaces with noise, holes and outliers."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[:height, :width]
+    depth_m = np.where(u + v > 0.6 * (height + width), 2.0 + 0.01 * u, 1.0 + 0.005 * v)
+    depth_m = depth_m + 0.004 * rng.normal(size=depth_m.shape)
+    outlier = rng.random(depth_m.shape) < 0.2
+    depth_m[outlier] *= rng.uniform(0.7, 1.5, outlier.sum())
+    depth_m[rng.random(depth_m.shape) < 0.2] = 0.0
+    return np.float32(depth_m).astype(float)
+
+
+@pytest.mark.parametrize("size", [(24, 32), (31, 17), (1, 9), (9, 1), (1, 1), (150, 7)])
+@pytest.mark.parametrize("minimum", [1, 4, 8])
+def test_support_matches_the_twin(size, minimum):
+    depth_m, settings = ragged(*size), (SIGMA, 4.2, 0.01, minimum)
+    expected = reference.keep_supported(depth_m, *settings)
+    np.testing.assert_array_equal(keep_supported(depth_m, *settings), expected)
+    if minimum == 4 and min(size) > 10:
+        assert 0 < np.count_nonzero(expected) < np.count_nonzero(depth_m)
+
+
+def test_a_smooth_surface_stays_and_flying_pixels_go():
+    v, u = np.mgrid[:40, :60]
+    depth_m = np.float32(1.5 + 0.004 * u + 0.002 * v)
+    clean = runtime.to_host(depth.without_flying_pixels(runtime.to_device(depth_m), SIGMA, 100.0))
+    np.testing.assert_array_equal(clean, depth_m)
+    flying = depth_m.copy()
+    flying[10, 10], flying[20, 30], flying[30, 40:42] = 0.8, 4.0, 2.5  # far from both sides, alone or in pairs
+    kept = runtime.to_host(depth.without_flying_pixels(runtime.to_device(flying), SIGMA, 100.0))
+    assert not kept[flying != depth_m].any()
+    np.testing.assert_array_equal(kept[flying == depth_m], depth_m[flying == depth_m])
+    assert flying[10, 10] == np.float32(0.8)  # the input is not changed
+
+
+def test_both_sides_of_an_edge_stay():
+    depth_m = np.full((20, 30), 1.0, np.float32)
+    depth_m[:, 15:] = 3.0
+    kept = depth.without_flying_pixels(runtime.to_device(depth_m), SIGMA, 100.0)
+    np.testing.assert_array_equal(runtime.to_host(kept), depth_m)
+
+
+def test_sensor_noise_is_no_reason_to_drop():
+    rng = np.random.default_rng(0)
+    depth_m = np.float32(3.0 + SIGMA * 9.0 * rng.normal(size=(100, 100)))
+    kept = runtime.to_host(depth.without_flying_pixels(runtime.to_device(depth_m), SIGMA, 500.0))
+    assert (kept > 0).mean() > 0.999
+
+
+def test_a_nan_measurement_is_dropped():
+    depth_m = np.full((9, 9), 2.0, np.float32)
+    depth_m[4, 4] = np.nan
+    kept = runtime.to_host(depth.without_flying_pixels(runtime.to_device(depth_m), SIGMA, 100.0))
+    assert kept[4, 4] == 0 and np.count_nonzero(kept) == 80
+
+
+def test_wrong_shapes_are_refused():
+    with pytest.raises(ValueError, match="depth_m"):
+        depth.without_flying_pixels(np.zeros((2, 3, 4), np.float32), SIGMA, 100.0)
+
+
+def plane(height=48, width=64):
+    """Inverse depth affine in the pixel."""
+    v, u = np.mgrid[:height, :width]
+    return np.float32(1.0 / (0.4 + 0.003 * u - 0.002 * v))
+
+
+@pytest.mark.parametrize("kind", ["random", "block", "grid", "many"])
+def test_holes_of_a_plane_are_filled_closely(kind):
+    exact_m = plane()
+    hole = np.zeros(exact_m.shape, bool)
+    rng = np.random.default_rng(1)
+    if kind == "block":
+        hole[20:28, 30:38] = True
+    elif kind == "grid":
+        hole[::2], hole[:, ::3] = True, True
+    else:
+        hole = rng.random(exact_m.shape) < (0.3 if kind == "random" else 0.9)
+    depth_m = np.where(hole, np.float32(0.0), exact_m)
+    filled = depth.filled(depth_m)
+    assert filled.dtype == np.float32
+    np.testing.assert_array_equal(filled[~hole], exact_m[~hole])
+    error = abs(filled - exact_m)[hole] / exact_m[hole]
+    assert np.median(error) < 0.01 and error.max() < 0.06
+
+
+def test_guesses_stay_between_the_nearest_and_the_farthest_measurement():
+    depth_m = np.float32(ragged(45, 33, seed=4))
+    filled = depth.filled(depth_m)
+    known = depth_m[depth_m > 0]
+    assert filled.min() >= known.min() * (1 - 1e-5) and filled.max() <= known.max() * (1 + 1e-5)
+    np.testing.assert_array_equal(filled[depth_m > 0], known)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 1), (2, 3), (33, 17)])
+def test_a_single_measurement_fills_the_image(size):
+    depth_m = np.zeros(size, np.float32)
+    depth_m[-1, size[1] // 2] = 2.5
+    np.testing.assert_allclose(depth.filled(depth_m), 2.5, rtol=1e-5)
+
+
+def test_nothing_to_fill_or_to_fill_from():
+    full, empty = plane(), np.zeros((7, 9), np.float32)
+    np.testing.assert_array_equal(depth.filled(full), full)
+    np.testing.assert_array_equal(depth.filled(empty), empty)
+
+
+def test_filling_leaves_its_input_alone():
+    depth_m = np.float32(ragged(20, 30))
+    before = depth_m.copy()
+    depth.filled(depth_m)
+    np.testing.assert_array_equal(depth_m, before)
