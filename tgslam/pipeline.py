@@ -176,10 +176,9 @@ def _check_tracked(name: str, reports: list[FrameReport]) -> None:
     tracked = sum(report.status is FrameStatus.TRACKED for report in reports)
     if reports and (used == 0 or (tracked == 0 and len(reports) > 1)):
         last = next((report.message for report in reversed(reports) if report.message), "no reason given")
-        raise TrackingError(
-            f"{name}: none of {len(reports)} frames could be tracked; the last one: {last}; "
-            "check dataset.depth_scale and the camera's fx, fy, cx, cy"
-        )
+        skipped = all(report.status is FrameStatus.SKIPPED for report in reports)
+        advice = "" if skipped else "; check dataset.depth_scale and the camera's fx, fy, cx, cy"
+        raise TrackingError(f"{name}: none of {len(reports)} frames could be tracked; the last one: {last}{advice}")
 
 
 def _save_partial(system: System, folder: RunFolder) -> None:

@@ -84,7 +84,10 @@ def evaluate_run(
             raise EvaluationError(
                 f"{source.name} has {len(source)} frames now, but this run saw {len(reports)}; restore its input"
             )
-        poses = held_out_poses(reports, every_frame, config.holdout_interval)
+        try:
+            poses = held_out_poses(reports, every_frame, config.holdout_interval)
+        except EvaluationError as error:
+            raise EvaluationError(f"{folder.trajectory}: {error}") from error
         metrics |= image_metrics(source, poses, gaussians, make_render(), stop_requested)
     return metrics
 
