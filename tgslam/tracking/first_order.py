@@ -19,7 +19,7 @@ from tgslam.vector_adam import VectorAdam
 
 
 class FirstOrderTracker:
-    """Adam on the pose, gain and bias under the whole of Eqs. 10-13, SSIM included."""
+    """Adam on the pose and the exposure under the whole of Eqs. 10-13, SSIM included."""
 
     def __init__(self, camera: Camera, config: TrackingConfig, loss: LossConfig) -> None:
         self.config, self.loss = config, loss
@@ -37,6 +37,8 @@ class FirstOrderTracker:
         """Pose of `frame` from the prediction T_cw [4, 4] and the last frame's exposure."""
         if self._gradient.mean.shape[0] != gaussians.capacity:
             self._gradient = MapGradient.zeros(gaussians.capacity)
+        if self.config.exposure == "none":
+            exposure = Exposure()
         observations = self._observations(frame)
         for level in reversed(range(len(self.cameras))):
             T_cw, exposure = self._descend(level, observations[level], gaussians, T_cw, exposure)
@@ -63,7 +65,8 @@ class FirstOrderTracker:
     ) -> tuple[NDArray[np.float64], Exposure]:
         rasterizer = self.rasterizers[level]
         rate = self.config.first_order_rate
-        adam = VectorAdam([rate] * 8)
+        fits_gain, fits_bias = self.config.exposure != "none", self.config.exposure == "gain_bias"
+        adam = VectorAdam([rate] * 6 + [rate * fits_gain, rate * fits_bias])
         to_frame = np.array([1.0 / exposure.gain, -exposure.bias / exposure.gain])  # the loss fits map to frame
         for _ in range(self.config.first_order_iterations[level]):
             rendered = rasterizer.forward(gaussians, T_cw)
@@ -76,4 +79,4 @@ class FirstOrderTracker:
             step = adam.step(np.concatenate([g_pose, [result.g_gain, result.g_bias]]))
             T_cw = se3_exp(step[:6]) @ T_cw
             to_frame = to_frame + step[6:]
-        return T_cw, Exposure(1.0 / to_frame[0], -to_frame[1] / to_frame[0])
+        return T_cw, Exposure(float(1.0 / to_frame[0]), float(-to_frame[1] / to_frame[0]))

@@ -52,7 +52,7 @@ class GaussNewtonTracker:
         self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure
     ) -> TrackingResult:
         """Pose of `frame` from the prediction T_cw [4, 4] and the last frame's exposure."""
-        live = live_pyramid(frame, self.camera, self.first, len(self.config.iterations), self.loss.gate_percentile)
+        live = live_pyramid(frame, self.camera, self.first, len(self.config.iterations), self.loss)
         for _ in range(self.config.renders):
             model = self._model(gaussians, T_cw)
             T_ml, exposure, last = self._align(live, model, exposure)
@@ -63,7 +63,7 @@ class GaussNewtonTracker:
         self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure
     ) -> TrackingResult:
         """What the frame says of a pose that another solver found; the pose stays as it is."""
-        live = live_pyramid(frame, self.camera, self.first, 1, self.loss.gate_percentile)
+        live = live_pyramid(frame, self.camera, self.first, 1, self.loss)
         equations = self._linearise(live[0], self._model(gaussians, T_cw)[0], np.eye(4), exposure)
         return self._result(T_cw, np.eye(4), exposure, equations)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tgslam import images, runtime
+from tgslam.config.schema import LossConfig
 from tgslam.types import Camera, Frame
 
 
@@ -45,7 +46,7 @@ def finest_level(camera: Camera, finest_width_px: int) -> int:
     return level
 
 
-def live_pyramid(frame: Frame, camera: Camera, first: int, levels: int, gate_percentile: float) -> list[LiveLevel]:
+def live_pyramid(frame: Frame, camera: Camera, first: int, levels: int, loss: LossConfig) -> list[LiveLevel]:
     """Levels of a frame, finest first: the frame halved `first` times, then once more for each next level."""
     depth, grey = runtime.to_device(frame.depth_m), images.luminance(runtime.to_device(frame.colour))
     for _ in range(first):
@@ -55,7 +56,7 @@ def live_pyramid(frame: Frame, camera: Camera, first: int, levels: int, gate_per
         if level:
             depth, grey = images.halve_depth(depth), images.halve(grey)
         grad_x, grad_y = images.sobel(grey)
-        gate = images.texture_gate(grey, gate_percentile)
+        gate = images.texture_gate(grey, loss.gate_percentile, loss.gate_noise_floor)
         result.append(LiveLevel(camera.halved(first + level), depth, grey, grad_x, grad_y, gate))
     return result
 

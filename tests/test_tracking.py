@@ -1,0 +1,536 @@
+"""Tracking with known truth: both solvers, exposure, information, lost frames, recovery and prediction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.reference import alignment as reference
+from tgslam import runtime
+from tgslam.config.schema import Config, LossConfig, SyntheticConfig, TrackingConfig
+from tgslam.datasets.synthetic import SyntheticSource
+from tgslam.gaussian_map import GaussianMap
+from tgslam.geometry import inverse, se3_exp, se3_log
+from tgslam.mapping.keyframe import Keyframe
+from tgslam.mapping.mapper import Mapper
+from tgslam.render import RenderImages
+from tgslam.tracking.exposure import Exposure, IntensityMoments, fit_exposure
+from tgslam.tracking.first_order import FirstOrderTracker
+from tgslam.tracking.gauss_newton import GaussNewtonTracker
+from tgslam.tracking.lost import evidence_against
+from tgslam.tracking.motion import ConstantVelocity
+from tgslam.tracking.pyramid import finest_level, live_pyramid, model_pyramid
+from tgslam.tracking.result import TrackingResult
+from tgslam.tracking.solver import make_tracker, track_or_recover
+from tgslam.types import Camera, Frame
+
+CONFIG = TrackingConfig()
+PATIENT = replace(CONFIG, solver="first_order", first_order_iterations=(60, 60), first_order_rate=0.002)
+CASES = [("room", 30), ("room", 120), ("blank", 30), ("blank", 120)]
+
+
+@cache
+def source(scene: str, noise: bool = False) -> SyntheticSource:
+    return SyntheticSource(SyntheticConfig(scene=scene, width=160, height=120, frames=700, noise=noise), 0)
+
+
+@cache
+def map_of(scene: str, index: int, noise: bool = False) -> GaussianMap:
+    """A map of one frame, refined until the error of tracking against it is tracking's own."""
+    config, one = Config(), source(scene, noise)
+    mapping = replace(config.mapping, iterations=60)
+    mapper = Mapper(one.camera, mapping, config.seeding, config.loss, np.random.default_rng(0))
+    T_cw = inverse(one.pose(index))
+    mapper.add_keyframe(Keyframe.from_frame(one.read(index), T_cw, Exposure(), np.eye(6)))
+    return mapper.gaussians
+
+
+@cache
+def tracker(config: TrackingConfig = CONFIG) -> GaussNewtonTracker | FirstOrderTracker:
+    return make_tracker(source("room").camera, config, LossConfig())
+
+
+def error(T_cw: np.ndarray, T_wc: np.ndarray) -> tuple[float, float]:
+    """Angle in degrees and distance in mm."""
+    rest = T_cw @ T_wc
+    return float(np.rad2deg(np.linalg.norm(se3_log(rest)[:3]))), 1000.0 * float(np.linalg.norm(rest[:3, 3]))
+
+
+def off_by(angle_deg: float, distance_m: float, seed: int) -> np.ndarray:
+    """A motion of that size in a random direction."""
+    ways = np.random.default_rng(seed).normal(size=(2, 3))
+    turn, move = ways / np.linalg.norm(ways, axis=1, keepdims=True)
+    return se3_exp(np.concatenate([np.deg2rad(angle_deg) * turn, distance_m * move]))
+
+
+# --- pose against the truth ---
+
+
+@pytest.mark.parametrize(("scene", "index"), CASES)
+@pytest.mark.parametrize("noise", [False, True])
+def test_gauss_newton_finds_the_next_frames(scene, index, noise):
+    """From the pose of the mapped frame; they are up to 2 degrees and 18 mm away. Noise: 1 sigma is 6 mm at 2 m."""
+    one, gaussians = source(scene, noise), map_of(scene, index, noise)
+    limit_deg, limit_mm = (0.1, 2.5) if noise else (0.03, 1.0)
+    for k in (1, 2, 3):
+        result = tracker().track(one.read(index + k), gaussians, inverse(one.pose(index)), Exposure())
+        angle_deg, distance_mm = error(result.T_cw, one.pose(index + k))
+        assert not result.lost, result.message
+        assert angle_deg < limit_deg and distance_mm < limit_mm
+        assert np.linalg.det(result.T_cw[:3, :3]) == pytest.approx(1.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("scene", ["room", "blank"])
+@pytest.mark.parametrize("noise", [False, True])
+def test_first_order_finds_the_next_frames_given_time(scene, noise):
+    one, gaussians = source(scene, noise), map_of(scene, 30, noise)
+    for k in (1, 3):
+        result = tracker(PATIENT).track(one.read(30 + k), gaussians, inverse(one.pose(30)), Exposure())
+        angle_deg, distance_mm = error(result.T_cw, one.pose(30 + k))
+        assert not result.lost, result.message
+        assert angle_deg < 0.15 and distance_mm < 4.0
+
+
+def test_first_order_with_default_steps_gains_on_the_prediction():
+    one, gaussians = source("room"), map_of("room", 30)
+    config = replace(CONFIG, solver="first_order")
+    result = tracker(config).track(one.read(32), gaussians, inverse(one.pose(30)), Exposure())
+    assert error(result.T_cw, one.pose(32))[0] < 0.5 * error(inverse(one.pose(30)), one.pose(32))[0]
+
+
+@pytest.mark.parametrize(("scene", "index"), CASES[:3])
+def test_gauss_newton_converges_from_two_degrees_and_three_centimetres(scene, index):
+    one, gaussians = source(scene), map_of(scene, index)
+    for seed in range(6):
+        start = off_by(2.0, 0.03, seed) @ inverse(one.pose(index + 2))
+        result = tracker().track(one.read(index + 2), gaussians, start, Exposure())
+        angle_deg, distance_mm = error(result.T_cw, one.pose(index + 2))
+        assert not result.lost and angle_deg < 0.05 and distance_mm < 2.5, seed
+
+
+def test_first_order_converges_from_one_degree_and_a_centimetre():
+    one, gaussians = source("room"), map_of("room", 30)
+    for seed in range(3):
+        start = off_by(1.0, 0.01, seed) @ inverse(one.pose(32))
+        result = tracker(PATIENT).track(one.read(32), gaussians, start, Exposure())
+        angle_deg, distance_mm = error(result.T_cw, one.pose(32))
+        assert angle_deg < 0.2 and distance_mm < 5.0, seed
+
+
+def test_another_render_at_the_estimate_does_no_harm():
+    one, gaussians = source("room"), map_of("room", 30)
+    start = off_by(2.0, 0.03, 0) @ inverse(one.pose(32))
+    twice = tracker(replace(CONFIG, renders=2)).track(one.read(32), gaussians, start, Exposure())
+    angle_deg, distance_mm = error(twice.T_cw, one.pose(32))
+    assert angle_deg < 0.03 and distance_mm < 1.0
+
+
+@pytest.mark.parametrize("config", [CONFIG, replace(CONFIG, solver="first_order")])
+def test_tracking_repeats_bit_for_bit(config):
+    one, gaussians = source("room", True), map_of("room", 30, True)
+    first, again = (
+        make_tracker(one.camera, config, LossConfig()).track(one.read(32), gaussians, inverse(one.pose(30)), Exposure())
+        for _ in range(2)
+    )
+    assert first.T_cw.tobytes() == again.T_cw.tobytes()
+    assert first.information.tobytes() == again.information.tobytes()
+    assert first.exposure == again.exposure and first.measures == again.measures
+
+
+def test_large_images_are_tracked_at_a_lower_resolution():
+    camera = source("room").camera
+    assert [finest_level(camera, width) for width in (1000, 160, 159, 80, 79)] == [0, 0, 1, 1, 2]
+    camera = Camera(2 * TINY.width, 2 * TINY.height, 2 * TINY.fx, 2 * TINY.fy, 2 * TINY.cx + 0.5, 2 * TINY.cy + 0.5)
+    assert camera.halved() == TINY
+    scene = Planes((WALL, SIDE, FLOOR), contrast=0.3)
+    half = GaussNewtonTracker(camera, replace(CONFIG, finest_width_px=TINY.width), LossConfig())
+    assert half.rasterizer.camera == TINY
+    half.rasterizer = scene
+    result = half.track(replace(scene, camera=camera).frame(MOTION), None, np.eye(4), Exposure())
+    angle_deg, distance_mm = error(result.T_cw, inverse(MOTION))
+    assert not result.lost and angle_deg < 0.03 and distance_mm < 1.5
+
+
+# --- exposure ---
+
+
+def with_exposure(frame: Frame, gain: float, bias: float = 0.0) -> Frame:
+    return replace(frame, colour=frame.colour * np.float32(gain) + np.float32(bias))
+
+
+@pytest.mark.parametrize("gain", [0.8, 1.25])
+def test_the_gain_of_a_frame_is_found_and_the_pose_does_not_suffer(gain):
+    one, gaussians = source("room"), map_of("room", 30)
+    frame = with_exposure(one.read(32), gain)
+    result = tracker().track(frame, gaussians, inverse(one.pose(30)), Exposure())
+    assert result.exposure.gain == pytest.approx(1.0 / gain, rel=2e-3) and result.exposure.bias == 0.0
+    angle_deg, distance_mm = error(result.T_cw, one.pose(32))
+    assert angle_deg < 0.03 and distance_mm < 1.0
+    assert result.measures["gain"] == result.exposure.gain
+
+
+def test_gain_and_bias_are_found_together():
+    """Up to what a rendered model's lost contrast adds to both, which a frame of gain 1 shows."""
+    one, gaussians = source("room"), map_of("room", 30)
+    both, start = tracker(replace(CONFIG, exposure="gain_bias")), inverse(one.pose(30))
+    plain = both.track(one.read(32), gaussians, start, Exposure()).exposure
+    assert plain.gain == pytest.approx(1.0, abs=0.04) and plain.bias == pytest.approx(0.0, abs=0.02)
+    changed = both.track(with_exposure(one.read(32), 0.8, 0.05), gaussians, start, Exposure()).exposure
+    assert changed.gain == pytest.approx(plain.gain / 0.8, rel=2e-3)
+    assert changed.bias == pytest.approx(plain.bias - plain.gain / 0.8 * 0.05, abs=2e-3)
+
+
+@pytest.mark.parametrize("solver", ["gauss_newton", "first_order"])
+@pytest.mark.parametrize("model", ["none", "gain", "gain_bias"])
+def test_only_what_the_exposure_model_names_is_fitted(solver, model):
+    one, gaussians = source("room"), map_of("room", 30)
+    config = replace(CONFIG, solver=solver, exposure=model)
+    frame = with_exposure(one.read(31), 0.95, 0.02)
+    found = tracker(config).track(frame, gaussians, inverse(one.pose(30)), Exposure()).exposure
+    assert (found.gain != 1.0) == (model != "none")
+    assert (found.bias != 0.0) == (model == "gain_bias")
+
+
+def moments(live: np.ndarray, model: np.ndarray) -> IntensityMoments:
+    return IntensityMoments(*(float(x) for x in (live.size, live.sum(), model.sum(), live @ live, live @ model)))
+
+
+LIVE = np.random.default_rng(0).uniform(0.2, 0.8, 1000)
+OTHER = Exposure(1.3, -0.1)
+
+
+def test_fits_are_exact_where_the_model_holds():
+    assert fit_exposure(moments(LIVE, 1.4 * LIVE), "gain", OTHER).gain == pytest.approx(1.4, rel=1e-12)
+    both = fit_exposure(moments(LIVE, 1.4 * LIVE - 0.1), "gain_bias", OTHER)
+    assert both.gain == pytest.approx(1.4, rel=1e-9) and both.bias == pytest.approx(-0.1, rel=1e-8)
+    assert fit_exposure(moments(LIVE, 1.4 * LIVE), "none", OTHER) == Exposure(1.0, 0.0)
+
+
+def test_blur_of_the_model_shows_in_gain_bias_and_not_in_gain():
+    """Half of the contrast is lost about the same mean."""
+    blurred = LIVE.mean() + 0.5 * (LIVE - LIVE.mean())
+    assert fit_exposure(moments(LIVE, blurred), "gain", OTHER).gain == pytest.approx(1.0, rel=1e-12)
+    both = fit_exposure(moments(LIVE, blurred), "gain_bias", OTHER)
+    assert both.gain == pytest.approx(0.5) and both.bias == pytest.approx(0.5 * LIVE.mean())
+
+
+@pytest.mark.parametrize("model", ["gain", "gain_bias"])
+def test_undetermined_exposures_stay_what_they_were(model):
+    black = np.full(1000, 1e-5)
+    for live, rendered in ((LIVE[:0], LIVE[:0]), (black, LIVE), (LIVE, black)):
+        assert fit_exposure(moments(live, rendered), model, OTHER) == OTHER
+
+
+def test_one_intensity_determines_a_gain_only():
+    grey = np.full(1000, 0.5)
+    assert fit_exposure(moments(grey, 0.6 * grey / 0.5), "gain_bias", OTHER) == Exposure(pytest.approx(1.2), 0.0)
+
+
+@pytest.mark.parametrize("slope", [-0.5, 0.01, 20.0])
+def test_an_absurd_contrast_is_no_exposure(slope):
+    rendered = 0.5 + slope * (LIVE - LIVE.mean())
+    assert fit_exposure(moments(LIVE, rendered), "gain_bias", OTHER) == OTHER
+
+
+# --- information, on scenes that are rendered exactly from any pose ---
+
+TINY = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+WALL, SIDE, FLOOR = ((0.1, 0.05, -1.0), 3.0), ((-1.0, 0.0, 0.0), 1.2), ((0.0, -1.0, 0.0), 0.8)
+
+
+@dataclass
+class Planes:
+    """Planes (normal, offset) with smooth intensities; stands in for a rasterizer, as a map without any error."""
+
+    planes: tuple
+    contrast: float = 0.0
+    camera: Camera = TINY
+
+    def images(self, T_cw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        v, u = np.mgrid[: self.camera.height, : self.camera.width]
+        rays = np.stack([(u - self.camera.cx) / self.camera.fx, (v - self.camera.cy) / self.camera.fy, 1.0 + 0 * u], -1)
+        z = np.full(u.shape, np.inf)
+        for normal, offset in self.planes:
+            n_c = T_cw[:3, :3] @ np.array(normal) / np.linalg.norm(normal)
+            depth = -(offset / np.linalg.norm(normal) - n_c @ T_cw[:3, 3]) / (rays @ n_c)
+            z = np.minimum(z, np.where(depth > 0, depth, np.inf))
+        T_wc = inverse(T_cw)
+        x, y, w = np.moveaxis((rays * z[..., None]) @ T_wc[:3, :3].T + T_wc[:3, 3], -1, 0)
+        grey = 0.5 + self.contrast * (np.sin(3.0 * x + 1.0) + np.cos(4.0 * y) + np.sin(2.5 * w + x)) / 3
+        return grey.astype(np.float32), z.astype(np.float32)
+
+    def frame(self, T_cw: np.ndarray) -> Frame:
+        grey, depth_m = self.images(T_cw)
+        return Frame(0, 0.0, np.repeat(grey[..., None], 3, axis=2), depth_m)
+
+    def forward(self, gaussians: GaussianMap | None, T_cw: np.ndarray) -> RenderImages:
+        frame = self.frame(T_cw)
+        images = (frame.colour, frame.depth_m, np.ones_like(frame.depth_m), np.zeros_like(frame.colour))
+        return RenderImages(*(runtime.to_device(image) for image in images))
+
+
+def exact_tracker(scene: Planes, config: TrackingConfig = CONFIG) -> GaussNewtonTracker:
+    result = GaussNewtonTracker(scene.camera, config, LossConfig())
+    result.rasterizer = scene
+    return result
+
+
+MOTION = se3_exp([0.005, -0.01, 0.004, 0.01, 0.004, -0.006])
+
+
+def test_three_planes_determine_the_pose_without_any_texture():
+    scene = Planes((WALL, SIDE, FLOOR))
+    result = exact_tracker(scene).track(scene.frame(MOTION), None, np.eye(4), Exposure())
+    angle_deg, distance_mm = error(result.T_cw, inverse(MOTION))
+    assert not result.lost and angle_deg < 0.05 and distance_mm < 1.0
+    values = np.linalg.eigvalsh(result.information)
+    assert values[0] > 1e-4 * values[-1] and result.measures["condition"] < 1e4
+    np.testing.assert_allclose(result.information, result.information.T, rtol=1e-9)
+
+
+def test_one_blank_plane_leaves_three_directions_and_the_frame_is_lost():
+    """Sliding along the plane, two ways, and turning about its normal."""
+    scene = Planes((WALL,))
+    result = exact_tracker(scene).track(scene.frame(MOTION), None, np.eye(4), Exposure())
+    assert result.lost and "not determined" in result.message and "condition" in result.message
+    values, directions = np.linalg.eigh(result.information)
+    assert (abs(values[:3]) < 1e-6 * values[3]).all()
+    normal = result.T_cw[:3, :3] @ np.array(WALL[0]) / np.linalg.norm(WALL[0])
+    blind = np.zeros((6, 3))
+    blind[3:, :2] = np.linalg.svd(normal[None])[2][1:].T
+    blind[:3, 2] = normal
+    outside = blind - directions[:, :3] @ (directions[:, :3].T @ blind)
+    assert abs(outside).max() < 1e-3
+
+
+def test_two_blank_planes_leave_the_direction_of_their_intersection():
+    scene = Planes((WALL, FLOOR))
+    result = exact_tracker(scene).track(scene.frame(MOTION), None, np.eye(4), Exposure())
+    values, directions = np.linalg.eigh(result.information)
+    assert abs(values[0]) < 5e-3 * values[1]
+    line = np.cross(*(result.T_cw[:3, :3] @ np.array(plane[0]) for plane in (WALL, FLOOR)))
+    assert abs(directions[3:, 0] @ line) / np.linalg.norm(line) > 0.999
+
+
+def test_texture_determines_what_one_plane_leaves_open():
+    scene = Planes((WALL,), contrast=0.4)
+    result = exact_tracker(scene).track(scene.frame(MOTION), None, np.eye(4), Exposure())
+    angle_deg, distance_mm = error(result.T_cw, inverse(MOTION))
+    assert not result.lost and angle_deg < 0.05 and distance_mm < 2.0
+
+
+def twin_images(level: object, names: dict[str, str]) -> dict[str, np.ndarray]:
+    return {name: runtime.to_host(getattr(level, of)).astype(float) for name, of in names.items()}
+
+
+GREY = {"depth": "depth", "grey": "grey", "gx": "grad_x", "gy": "grad_y"}
+SECOND = {"gxx": "grad_xx", "gxy": "grad_xy", "gyy": "grad_yy", "normal": "normal"}
+
+
+def test_the_information_is_how_the_cost_grows_with_the_pose():
+    """By a left perturbation of T_cw, far from the model's pose, so that the adjoint between them matters."""
+    scene = Planes((WALL, SIDE, FLOOR), contrast=0.3)
+    T_mw = se3_exp([0.03, -0.06, 0.05, 0.12, -0.08, 0.1])
+    frame = scene.frame(MOTION)
+    result = exact_tracker(scene).track(frame, None, T_mw, Exposure())
+    loss = LossConfig()
+    live = twin_images(live_pyramid(frame, TINY, 0, 1, loss)[0], GREY | {"gate": "gate"})
+    grey, depth = (runtime.to_device(image) for image in scene.images(T_mw))
+    model = twin_images(model_pyramid(grey, depth, TINY, 1, loss.depth_sigma_per_m2)[0], GREY | SECOND)
+    settings = reference.Settings(
+        TINY.fx, TINY.fy, TINY.cx, TINY.cy, result.exposure.gain, result.exposure.bias,
+        loss.depth_sigma_per_m2, CONFIG.max_distance_sigmas, loss.charbonnier_depth_sigmas, loss.gate_depth_boost,
+        CONFIG.sigma_colour, CONFIG.sigma_gradient, CONFIG.weight_depth, CONFIG.weight_colour, CONFIG.weight_gradient,
+    )  # fmt: skip
+    assert len(fields(settings)) == 15
+
+    def cost(xi: np.ndarray) -> float:
+        return reference.cost(settings, T_mw @ inverse(se3_exp(xi) @ result.T_cw), live, model)
+
+    ways = [*np.eye(6)[[0, 4]], *np.random.default_rng(2).normal(size=(3, 6))]
+    for way in ways:
+        step = way / np.sqrt(way @ result.information @ way) * 12.0  # a small part of a sigma for each pixel
+        growth = cost(step) + cost(-step) - 2 * cost(np.zeros(6))
+        assert growth == pytest.approx(step @ result.information @ step, rel=0.1)
+
+
+def test_assessing_a_pose_agrees_with_having_tracked_it():
+    scene = Planes((WALL, SIDE, FLOOR), contrast=0.3)
+    one = exact_tracker(scene)
+    tracked = one.track(scene.frame(MOTION), None, np.eye(4), Exposure())
+    assessed = one.assess(scene.frame(MOTION), None, tracked.T_cw, tracked.exposure)
+    np.testing.assert_array_equal(assessed.T_cw, tracked.T_cw)
+    scale = np.sqrt(np.diag(tracked.information))
+    ratio = (assessed.information - tracked.information) / np.outer(scale, scale)
+    assert abs(ratio).max() < 0.1
+    assert not assessed.lost and assessed.measures["inlier_ratio"] > 0.8  # creases have no normals
+
+
+# --- lost ---
+
+GOOD = {"overlap": 0.9, "inlier_ratio": 0.9, "condition": 100.0}
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"overlap": 0.05}, "5% of the frame meets the map"),
+        ({"inlier_ratio": 0.2}, "20% of the matched pixels"),
+        ({"condition": 1e9}, "not determined"),
+        ({"condition": float("inf")}, "not determined"),
+        ({"condition": float("nan")}, "not determined"),
+    ],
+)
+def test_evidence_names_what_is_wrong(change, word):
+    assert evidence_against(GOOD, CONFIG) == ""
+    assert word in evidence_against(GOOD | change, CONFIG)
+
+
+def test_thresholds_are_the_configs():
+    lenient = replace(CONFIG, lost_overlap=0.01, lost_inlier_ratio=0.0, lost_condition=1e12)
+    assert evidence_against({"overlap": 0.02, "inlier_ratio": 0.01, "condition": 1e10}, lenient) == ""
+    strict = replace(CONFIG, lost_overlap=0.95)
+    assert "meets the map" in evidence_against(GOOD, strict)
+
+
+def unrelated(kind: str, frame: Frame) -> Frame:
+    rng, shape = np.random.default_rng(0), frame.depth_m.shape
+    if kind == "another room":
+        return source("desk", noise=True).read(200)
+    depth_m = {
+        "twice as far": lambda: 2.0 * frame.depth_m,
+        "half as far": lambda: 0.5 * frame.depth_m,
+        "a hand on the lens": lambda: np.full(shape, 0.3),
+        "noise": lambda: rng.uniform(0.5, 5.0, shape),
+        "no depth": lambda: np.zeros(shape),
+    }[kind]()
+    colour = rng.random(frame.colour.shape) if kind == "noise" else frame.colour
+    return replace(frame, colour=colour.astype(np.float32), depth_m=depth_m.astype(np.float32))
+
+
+KINDS = ["another room", "twice as far", "half as far", "a hand on the lens", "noise", "no depth"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("scene", ["room", "blank"])
+@pytest.mark.parametrize("solver", ["gauss_newton", "first_order"])
+def test_an_unrelated_frame_is_lost_and_the_message_says_why(kind, scene, solver):
+    one, gaussians = source(scene, True), map_of(scene, 30, True)
+    config = replace(CONFIG, solver=solver, first_order_iterations=(4, 4))
+    result = tracker(config).track(unrelated(kind, one.read(31)), gaussians, inverse(one.pose(30)), Exposure())
+    assert result.lost
+    assert "meets the map" in result.message or "three sigma" in result.message
+    assert np.isfinite(result.T_cw).all() and np.isfinite(result.exposure.gain)
+
+
+@pytest.mark.parametrize("solver", ["gauss_newton", "first_order"])
+def test_an_empty_map_loses_every_frame(solver):
+    one = source("room")
+    config = replace(CONFIG, solver=solver, first_order_iterations=(2, 2))
+    result = tracker(config).track(one.read(0), GaussianMap(), np.eye(4), Exposure())
+    assert result.lost and "meets the map" in result.message
+    assert result.measures["unexplained"] == 1.0
+    np.testing.assert_allclose(result.T_cw, np.eye(4), atol=1e-6)
+
+
+# --- recovery ---
+
+
+class FakeTracker:
+    """Holds only where the given pose is one of `good`; remembers what it was asked."""
+
+    rasterizer = None
+
+    def __init__(self, good: list[float]) -> None:
+        self.good, self.asked = good, []
+
+    def track(self, frame, gaussians, T_cw, exposure):
+        self.asked.append(T_cw[0, 3])
+        lost = T_cw[0, 3] not in self.good
+        measures = {"start": float(T_cw[0, 3])}
+        found = se3_exp([0, 0, 0, 0, 0, 1.0]) @ T_cw
+        return TrackingResult(found, Exposure(2.0), np.eye(6), lost, "lost" if lost else "", measures)
+
+
+def at(x: float) -> np.ndarray:
+    return se3_exp([0, 0, 0, x, 0, 0])
+
+
+def recover(good: list[float]) -> tuple[TrackingResult, FakeTracker]:
+    fake = FakeTracker(good)
+    fallbacks = (at(x) for x in (1.0, 2.0, 3.0))
+    return track_or_recover(fake, None, None, at(0.0), fallbacks, Exposure(1.5)), fake
+
+
+def test_a_good_prediction_needs_no_fallback():
+    result, fake = recover([0.0, 1.0])
+    assert fake.asked == [0.0] and not result.lost and result.T_cw[2, 3] == 1.0
+
+
+def test_fallbacks_are_tried_in_order_until_one_holds():
+    result, fake = recover([2.0, 3.0])
+    assert fake.asked == [0.0, 1.0, 2.0]
+    assert not result.lost and result.T_cw[0, 3] == 2.0 and result.exposure == Exposure(2.0)
+
+
+def test_where_nothing_holds_the_camera_coasts_with_the_evidence_of_the_first_attempt():
+    result, fake = recover([])
+    assert fake.asked == [0.0, 1.0, 2.0, 3.0]
+    assert result.lost and result.message == "lost" and result.measures == {"start": 0.0}
+    np.testing.assert_array_equal(result.T_cw, at(0.0))
+    assert result.exposure == Exposure(1.5)
+
+
+def test_a_fallback_recovers_a_real_frame():
+    one, gaussians = source("room"), map_of("room", 30)
+    away = se3_exp([0.0, 3.0, 0.0, 0.0, 0.0, 0.0]) @ inverse(one.pose(30))
+    result = track_or_recover(tracker(), one.read(31), gaussians, away, [inverse(one.pose(30))], Exposure())
+    assert not result.lost and error(result.T_cw, one.pose(31))[1] < 1.0
+
+
+# --- prediction ---
+
+VELOCITY = np.array([0.3, -0.2, 0.1, 0.5, 0.1, -0.4])  # rad/s, m/s
+START = se3_exp([0.2, 0.1, -0.3, 1.0, 2.0, 3.0])
+
+
+def moved(seconds: float) -> np.ndarray:
+    return se3_exp(VELOCITY * seconds) @ START
+
+
+def test_without_a_past_nothing_moves():
+    motion = ConstantVelocity()
+    np.testing.assert_array_equal(motion.predict(5.0), np.eye(4))
+    motion.update(5.0, START)
+    np.testing.assert_allclose(motion.predict(9.0), START, atol=1e-12)
+
+
+@pytest.mark.parametrize("times_s", [(0.0, 0.1, 0.2), (0.0, 0.03, 0.5), (7.0, 7.9, 7.95)])
+def test_a_steady_motion_is_foretold_at_any_time(times_s):
+    motion = ConstantVelocity()
+    for time_s in times_s[:2]:
+        motion.update(time_s, moved(time_s))
+    np.testing.assert_allclose(motion.predict(times_s[2]), moved(times_s[2]), atol=1e-9)
+    np.testing.assert_allclose(motion.predict(times_s[1]), moved(times_s[1]), atol=1e-12)
+
+
+def test_equal_or_earlier_timestamps_keep_the_velocity():
+    motion = ConstantVelocity()
+    motion.update(0.0, moved(0.0))
+    motion.update(0.1, moved(0.1))
+    for time_s in (0.1, 0.05):
+        motion.update(time_s, START)
+        np.testing.assert_allclose(motion.predict(time_s + 0.2), moved(0.2), atol=1e-9)
+
+
+def test_slowing_down_halves_the_motion_each_time():
+    motion = ConstantVelocity()
+    motion.update(0.0, moved(0.0))
+    motion.update(1.0, moved(1.0))
+    motion.slow_down()
+    np.testing.assert_allclose(motion.predict(2.0), moved(1.5), atol=1e-9)
+    motion.slow_down()
+    np.testing.assert_allclose(motion.predict(2.0), moved(1.25), atol=1e-9)
