@@ -46,7 +46,7 @@ class GaussNewtonTracker:
         self.config, self.loss = config, loss
         self.first = finest_level(camera, config.finest_width_px)
         self.camera = camera
-        self.rasterizer = Rasterizer(camera.halved(self.first))
+        self.rasterizer = Rasterizer(camera)
 
     def track(
         self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure
@@ -85,16 +85,21 @@ class GaussNewtonTracker:
         return TrackingResult(T_cw, exposure, information, bool(message), message, measures)
 
     def _model(self, gaussians: GaussianMap, T_cw: NDArray[np.float64]) -> list[ModelLevel]:
+        """Rendered at full size and halved like the frame.
+
+        In a smaller image the rasterizer's low-pass filter widens the splats: near ones reach over edges, and the pose
+        is drawn by millimetres.
+        """
         rendered = self.rasterizer.forward(gaussians, T_cw)
         opacity = runtime.to_host(rendered.opacity)
         covered = opacity > self.config.min_opacity
         safe = np.maximum(opacity, self.config.min_opacity)
-        depth = np.where(covered, runtime.to_host(rendered.depth) / safe, np.float32(0.0))
+        depth = runtime.to_device(np.where(covered, runtime.to_host(rendered.depth) / safe, np.float32(0.0)))
         grey = images.luminance(rendered.colour)  # not divided: the map's colours are fitted to be seen over black
-        return model_pyramid(
-            grey, runtime.to_device(depth), self.rasterizer.camera, len(self.config.iterations),
-            self.loss.depth_sigma_per_m2,
-        )  # fmt: skip
+        for _ in range(self.first):
+            depth, grey = images.halve_depth(depth), images.halve(grey)
+        camera = self.camera.halved(self.first)
+        return model_pyramid(grey, depth, camera, len(self.config.iterations), self.loss.depth_sigma_per_m2)
 
     def _align(
         self, live: list[LiveLevel], model: list[ModelLevel], exposure: Exposure
