@@ -44,11 +44,16 @@ def view(mapper: Mapper, T_cw: NDArray) -> Rendering:
     return Rasterizer(mapper.camera).render(mapper.gaussians, T_cw)
 
 
+def rows_of(owner: object) -> dict[str, NDArray]:
+    """What the mapper or the refiner keeps by the Gaussian."""
+    return {name: value for name, value in vars(owner).items() if isinstance(value, np.ndarray)}
+
+
 def assert_rows_agree(mapper: Mapper) -> None:
     """Everything that is kept by the Gaussian has as many rows as the map."""
-    count = mapper.gaussians.count
-    rows = [mapper.support, mapper.conflict, mapper.refiner.contribution, mapper.refiner.views]
-    assert [len(array) for array in rows] == [count] * 4
+    rows = {**rows_of(mapper), **rows_of(mapper.refiner)}
+    assert {"support", "conflict", "contribution", "views"} <= set(rows)
+    assert {name: len(array) for name, array in rows.items()} == dict.fromkeys(rows, mapper.gaussians.count)
 
 
 def mapped(source: SyntheticSource, indices: range, **settings: Any) -> Mapper:
@@ -89,11 +94,14 @@ def test_the_first_keyframe_is_mapped_whole(source: SyntheticSource) -> None:
 
 def test_what_the_map_shows_already_is_not_inserted_again(source: SyntheticSource) -> None:
     mapper = make_mapper(source)
-    for index in range(4):
+    mapper.add_keyframe(keyframe(source, source.read(0)))
+    first = mapper.gaussians.count
+    for index in range(1, 4):
         mapper.add_keyframe(keyframe(source, replace(source.read(0), index=index), np.eye(4)))
     born = np.bincount(mapper.gaussians.host("birth_keyframe"))
     assert born[0] > 4000
-    assert born[1:].sum() < 0.01 * born[0]
+    assert born[1:].sum() < 0.03 * born[0]
+    assert mapper.gaussians.count < 1.015 * first
 
 
 def test_a_new_area_is_inserted_where_it_is(source: SyntheticSource) -> None:
@@ -130,7 +138,8 @@ def test_what_stands_in_front_of_the_map_is_inserted(source: SyntheticSource) ->
     rendering = view(mapper, np.eye(4))
     inner = (slice(48, 72), slice(68, 92))
     # A fresh surface is not quite opaque: what stands behind it shines through in colour and depth
-    assert np.median(((rendering.depth_m - depth_m) / (frame.depth_m - depth_m))[inner]) < 0.1
+    error_m, gap_m = np.abs(rendering.depth_m - depth_m)[inner], (frame.depth_m - depth_m)[inner]
+    assert np.median(error_m) < 0.1 * np.median(gap_m)
     assert np.abs(rendering.colour[inner].mean((0, 1)) - [1.0, 0.0, 0.0]).max() < 0.1
 
 
@@ -190,8 +199,8 @@ def plant(mapper: Mapper, gaussians: Gaussians) -> None:
     """Add Gaussians by hand, with their rows everywhere."""
     mapper.gaussians.append(gaussians)
     mapper.refiner.append(len(gaussians))
-    mapper.support = np.append(mapper.support, np.zeros(len(gaussians), np.int32))
-    mapper.conflict = np.append(mapper.conflict, np.zeros(len(gaussians), np.int32))
+    for name, array in rows_of(mapper).items():
+        setattr(mapper, name, np.append(array, np.zeros(len(gaussians), array.dtype)))
 
 
 def test_what_never_shows_goes(source: SyntheticSource) -> None:
@@ -209,7 +218,7 @@ def test_what_never_shows_goes(source: SyntheticSource) -> None:
     assert middle.sum() > 500
 
     assert born[99] < 0.02 * middle.sum()
-    assert born[0] > 0.98 * len(seen)
+    assert born[0] > 0.9 * len(seen)
     assert_rows_agree(mapper)
 
 
