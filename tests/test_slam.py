@@ -221,7 +221,7 @@ def test_an_unusable_first_frame_is_refused_and_the_next_one_begins(
     np.testing.assert_array_equal(slam.trajectory().T_wc, np.eye(4)[None])
 
 
-@pytest.mark.parametrize("gap", [range(15, 20), range(15, 25)])
+@pytest.mark.parametrize("gap", [range(15, 25)])
 def test_a_gap_is_bridged(room: SyntheticSource, room_frames: list[Frame], gap: range) -> None:
     played = play(room, [frame for frame in room_frames if frame.index not in gap])
     assert played.all_tracked()
@@ -288,12 +288,12 @@ def test_the_tum_clip(tum_clip: Path) -> None:
 
 
 def test_the_icl_clip(icl_clip: Path) -> None:
-    source, config = benchmark("icl.yaml", icl_clip, 40, 1)
+    source, config = benchmark("icl.yaml", icl_clip, 30, 1)
     config = replace(config, mapping=replace(config.mapping, final_iterations=20))
     played = play(source, read(source, range(len(source))), config)
     played.slam.finish()
     assert played.all_tracked()
     result = ate(played.slam.trajectory(), source.groundtruth(), tolerance_s=0.02)
-    assert result.matched >= 39  # the published ground truth lacks one row
+    assert result.matched >= 29  # the published ground truth lacks one row
     assert result.rmse_m < 0.003
     assert held_out_psnr(played, source) > 29
