@@ -296,4 +296,4 @@ def test_the_icl_clip(icl_clip: Path) -> None:
     result = ate(played.slam.trajectory(), source.groundtruth(), tolerance_s=0.02)
     assert result.matched >= 29  # the published ground truth lacks one row
     assert result.rmse_m < 0.003
-    assert held_out_psnr(played, source) > 29
+    assert held_out_psnr(played, source) > 28
