@@ -17,6 +17,7 @@ SPLAT = 15  # columns of a splat row: u, v, qa, qb, qc, opacity, z, zu, zv, r, g
 CURVATURE_COLOUR, CURVATURE_DEPTH = 15, 16
 SPLAT_GRAD = 17  # a gradient row has two more: the summed weights of the colour and the depth residuals
 
+BLUR_DEPTH = 0.03  # px^2 in the regression of depth on the pixel: BLUR would flatten the depth slope of small splats
 BLUR = 0.3  # px^2 added to the screen covariance, the 3DGS standard's low-pass filter
 NEAR_M = 0.05
 EDGE = 1.3  # the Jacobian is evaluated at most this many half-images off the axis
@@ -55,19 +56,20 @@ def clamped(ratio, centre, focal, size):
 
 
 @ti.func
-def blurred_determinant(ax: ti.template(), ay: ti.template()):
-    """det of the screen covariance A A^T + BLUR I, by Lagrange's identity for det(A A^T).
+def blurred_determinant(ax: ti.template(), ay: ti.template(), blur):
+    """det of the screen covariance A A^T + blur I, by Lagrange's identity for det(A A^T).
 
     cxx cyy - cxy^2 cancels to nothing in float32 for a long thin splat across the pixel grid; this sums positive terms.
     """
-    return ax.cross(ay).norm_sqr() + BLUR * (ax.norm_sqr() + ay.norm_sqr() + BLUR)
+    return ax.cross(ay).norm_sqr() + blur * (ax.norm_sqr() + ay.norm_sqr() + blur)
 
 
 @ti.func
-def precision_times_rows(ax: ti.template(), ay: ti.template(), inv_det):
-    """B = (A A^T + BLUR I)^-1 A, with the triple product since, for the reason above, B is small where A is large."""
+def precision_times_rows(ax: ti.template(), ay: ti.template(), blur):
+    """B = (A A^T + blur I)^-1 A, with the triple product since, for the reason above, B is small where A is large."""
     n = ax.cross(ay)
-    return (ay.cross(n) + BLUR * ax) * inv_det, (n.cross(ax) + BLUR * ay) * inv_det
+    inv_det = 1.0 / blurred_determinant(ax, ay, blur)
+    return (ay.cross(n) + blur * ax) * inv_det, (n.cross(ax) + blur * ay) * inv_det
 
 
 @ti.kernel
@@ -109,9 +111,9 @@ def project(
             ay = ti.Vector([fy * inv_z * M[1, k] + jy * M[2, k] for k in range(3)])
             mz = ti.Vector([M[2, 0], M[2, 1], M[2, 2]])
             cxx, cxy, cyy = ax.dot(ax) + BLUR, ax.dot(ay), ay.dot(ay) + BLUR
-            inv_det = 1.0 / blurred_determinant(ax, ay)
+            inv_det = 1.0 / blurred_determinant(ax, ay, BLUR)
             qxx, qxy, qyy = cyy * inv_det, -cxy * inv_det, cxx * inv_det
-            bx, by = precision_times_rows(ax, ay, inv_det)
+            bx, by = precision_times_rows(ax, ay, BLUR_DEPTH)
             u, v = fx * x[0] * inv_z + camera[2], fy * x[1] * inv_z + camera[3]
             opacity = sigmoid(opacity_logit[i])
             splat[i, U], splat[i, V] = u, v
@@ -182,21 +184,25 @@ def project_backward(
                 ax = ti.Vector([j0 * M[0, k] + jx * M[2, k] for k in range(3)])
                 ay = ti.Vector([j1 * M[1, k] + jy * M[2, k] for k in range(3)])
                 cxx, cxy, cyy = ax.dot(ax) + BLUR, ax.dot(ay), ay.dot(ay) + BLUR
-                inv_det = 1.0 / blurred_determinant(ax, ay)
+                inv_det = 1.0 / blurred_determinant(ax, ay, BLUR)
                 qxx, qxy, qyy = cyy * inv_det, -cxy * inv_det, cxx * inv_det
-                # Inverse covariance Q and depth slopes B mz -> rows of A = J M and the z row of M. With B = Q A and the
-                # part of mz that the slopes leave, no term of a long splat is the small difference of large ones:
-                # dQ = -Q dA B^T - B dA^T Q, d(slope) = Q dA rest - B dA^T slope + B dmz
-                bx, by = precision_times_rows(ax, ay, inv_det)
-                zu, zv = mz.dot(bx), mz.dot(by)
+                # Inverse covariance Q and depth slopes D mz -> rows of A = J M and the z row of M. With B = Q A and
+                # D = P A (Q with BLUR, P with BLUR_DEPTH) and the part of mz that the slopes leave, no term of a long
+                # splat is the small difference of large ones:
+                # dQ = -Q dA B^T - B dA^T Q, d(slope) = P dA rest - D dA^T slope + D dmz
+                bx, by = precision_times_rows(ax, ay, BLUR)
+                dx, dy = precision_times_rows(ax, ay, BLUR_DEPTH)
+                inv_depth_det = 1.0 / blurred_determinant(ax, ay, BLUR_DEPTH)
+                pxx, pxy, pyy = ay.dot(ay) + BLUR_DEPTH, -cxy, ax.dot(ax) + BLUR_DEPTH
+                zu, zv = mz.dot(dx), mz.dot(dy)
                 rest = mz - zu * ax - zv * ay
                 gu, gv, gz = splat_grad[i, U], splat_grad[i, V], splat_grad[i, Z]
                 gzu, gzv = splat_grad[i, ZU], splat_grad[i, ZV]
                 gxx, gxy, gyy = 0.5 * splat_grad[i, QA], 0.5 * splat_grad[i, QB], 0.5 * splat_grad[i, QC]
                 gbx, gby = gxx * bx + gxy * by, gxy * bx + gyy * by
-                gmz = gzu * bx + gzv * by
-                gax = (qxx * gzu + qxy * gzv) * rest - zu * gmz - 2.0 * (qxx * gbx + qxy * gby)
-                gay = (qxy * gzu + qyy * gzv) * rest - zv * gmz - 2.0 * (qxy * gbx + qyy * gby)
+                gmz = gzu * dx + gzv * dy
+                gax = (pxx * gzu + pxy * gzv) * inv_depth_det * rest - zu * gmz - 2.0 * (qxx * gbx + qxy * gby)
+                gay = (pxy * gzu + pyy * gzv) * inv_depth_det * rest - zv * gmz - 2.0 * (qxy * gbx + qyy * gby)
                 # Rows of A = J M -> J and M
                 m0 = ti.Vector([M[0, 0], M[0, 1], M[0, 2]])
                 m1 = ti.Vector([M[1, 0], M[1, 1], M[1, 2]])

@@ -55,6 +55,8 @@ G_COLOUR, G_DEPTH, G_OPACITY, G_TOTAL, G_EMBEDDING, W_COLOUR, W_DEPTH = 0, 3, 4,
 G = 11
 # Rows of the lane accumulators: like a gradient row, with moments of h = alpha dL/dalpha where u .. opacity go
 ACC_H, ACC_X, ACC_Y, ACC_XX, ACC_XY, ACC_YY = 0, 1, 2, 3, 4, 5
+ACC_SLOPE = SPLAT_GRAD  # and one more: the gradient by the slope term of the depth
+ACC = SPLAT_GRAD + 1
 
 
 @ti.kernel
@@ -144,7 +146,12 @@ def forward(
     with_embedding: ti.template(),
     out: nd(Lanes, ndim=2),  # [tiles * CHUNKS, OUT] out: sums of weight times channel, and the transmittance left
 ):
-    """Alpha blending front to back: colour, tangent-plane depth, embedding colour, transmittance."""
+    """Alpha blending front to back: colour, depth, embedding colour, transmittance.
+
+    A splat's depth at a pixel is that of its tangent plane. Inverse depth is affine on a plane, so with s the offset
+    times the slope, depth is z / (1 - s / z), here to second order: z + s + s^2 / z. To first order alone, surfaces at
+    grazing angles come out too near by about one sigma of the sensor, which turns and shifts a tracked camera.
+    """
     for spread in range(tiles * SPREAD):
         tile = spread // SPREAD
         if spread - tile * SPREAD == 0:
@@ -163,6 +170,7 @@ def forward(
                     dx0, dy0 = cx - slot[k, U], cy - slot[k, V]
                     qa, qb, qc, op = slot[k, QA], slot[k, QB], slot[k, QC], slot[k, OPACITY]
                     z, zu, zv = slot[k, Z], slot[k, ZU], slot[k, ZV]
+                    inv_z = 1.0 / z
                     c0, c1, c2 = slot[k, RED], slot[k, RED + 1], slot[k, RED + 2]
                     for j in ti.static(range(LANES)):
                         dx, dy = dx0 + (j % CHUNK), dy0 + (j // CHUNK)
@@ -172,7 +180,8 @@ def forward(
                         r[j] += w * c0
                         g[j] += w * c1
                         b[j] += w * c2
-                        d[j] += w * (z + zu * dx + zv * dy)
+                        s = zu * dx + zv * dy
+                        d[j] += w * (z + s * (1.0 + s * inv_z))
                         if ti.static(with_embedding):
                             e0[j] += w * slot[k, EMBEDDING]
                             e1[j] += w * slot[k, EMBEDDING + 1]
@@ -271,7 +280,7 @@ def backward(
     with_embedding: ti.template(),
     with_curvature: ti.template(),
     state: nd(Lanes, ndim=2),  # [tiles * CHUNKS, 2] scratch: transmittance and prefix sum of weight times g . c
-    acc: nd(Lanes, ndim=2),  # [tiles, SPLAT_GRAD] scratch
+    acc: nd(Lanes, ndim=2),  # [tiles, ACC] scratch
     slot_grad: nd(ti.f32, ndim=2),  # [slots, SPLAT_GRAD] out
 ):
     """Gradient of every slot, splat by splat over its chunks; nothing of the forward pass is stored but the image.
@@ -286,8 +295,9 @@ def backward(
             for k in range(start[tile], start[tile + 1]):
                 u, v, qa, qb, qc, op = slot[k, U], slot[k, V], slot[k, QA], slot[k, QB], slot[k, QC], slot[k, OPACITY]
                 z, zu, zv = slot[k, Z], slot[k, ZU], slot[k, ZV]
+                inv_z = 1.0 / z
                 c0, c1, c2 = slot[k, RED], slot[k, RED + 1], slot[k, RED + 2]
-                for c in ti.static(range(SPLAT_GRAD)):
+                for c in ti.static(range(ACC)):
                     acc[tile, c] = Lanes(0.0)
                 bits = mask[k]
                 while bits != 0:
@@ -301,7 +311,7 @@ def backward(
                     ge0, ge1, ge2 = g[row, G_EMBEDDING], g[row, G_EMBEDDING + 1], g[row, G_EMBEDDING + 2]
                     wc, wd = g[row, W_COLOUR], g[row, W_DEPTH]
                     a0, a1, a2 = acc[tile, RED], acc[tile, RED + 1], acc[tile, RED + 2]
-                    az, azu, azv = acc[tile, Z], acc[tile, ZU], acc[tile, ZV]
+                    az, azu, azv, as_ = acc[tile, Z], acc[tile, ZU], acc[tile, ZV], acc[tile, ACC_SLOPE]
                     ae0, ae1, ae2 = acc[tile, EMBEDDING], acc[tile, EMBEDDING + 1], acc[tile, EMBEDDING + 2]
                     ac, ad = acc[tile, CURVATURE_COLOUR], acc[tile, CURVATURE_DEPTH]
                     m, mx, my = acc[tile, ACC_H], acc[tile, ACC_X], acc[tile, ACC_Y]
@@ -312,7 +322,8 @@ def backward(
                         alpha = ti.min(ALPHA_MAX, raw)
                         alpha = ti.select(alpha > ALPHA_MIN, alpha, 0.0)
                         w = T[j] * alpha
-                        gc = g0[j] * c0 + g1[j] * c1 + g2[j] * c2 + gd[j] * (z + zu * dx + zv * dy) + go[j]
+                        s = zu * dx + zv * dy
+                        gc = g0[j] * c0 + g1[j] * c1 + g2[j] * c2 + gd[j] * (z + s * (1.0 + s * inv_z)) + go[j]
                         if ti.static(with_embedding):
                             gc += ge0[j] * slot[k, EMBEDDING] + ge1[j] * slot[k, EMBEDDING + 1]
                             gc += ge2[j] * slot[k, EMBEDDING + 2]
@@ -325,9 +336,12 @@ def backward(
                         a1[j] += w * g1[j]
                         a2[j] += w * g2[j]
                         wg = w * gd[j]
-                        az[j] += wg
-                        azu[j] += wg * dx
-                        azv[j] += wg * dy
+                        bend = s * inv_z
+                        az[j] += wg * (1.0 - bend * bend)
+                        ws = wg * (1.0 + 2.0 * bend)
+                        as_[j] += ws
+                        azu[j] += ws * dx
+                        azv[j] += ws * dy
                         if ti.static(with_embedding):
                             ae0[j] += w * ge0[j]
                             ae1[j] += w * ge1[j]
@@ -344,7 +358,7 @@ def backward(
                         myy[j] += hy * dy
                     state[row, 0], state[row, 1] = T, A
                     acc[tile, RED], acc[tile, RED + 1], acc[tile, RED + 2] = a0, a1, a2
-                    acc[tile, Z], acc[tile, ZU], acc[tile, ZV] = az, azu, azv
+                    acc[tile, Z], acc[tile, ZU], acc[tile, ZV], acc[tile, ACC_SLOPE] = az, azu, azv, as_
                     if ti.static(with_embedding):
                         acc[tile, EMBEDDING], acc[tile, EMBEDDING + 1], acc[tile, EMBEDDING + 2] = ae0, ae1, ae2
                     if ti.static(with_curvature):
@@ -361,10 +375,10 @@ def backward(
                     slot_grad[k, c] = 0.0
                     if ti.static(with_curvature):
                         slot_grad[k, c] = acc[tile, c].sum()
-                sx, sy, depth_sum = acc[tile, ACC_X].sum(), acc[tile, ACC_Y].sum(), slot_grad[k, Z]
+                sx, sy, slope_sum = acc[tile, ACC_X].sum(), acc[tile, ACC_Y].sum(), acc[tile, ACC_SLOPE].sum()
                 slot_grad[k, OPACITY] = acc[tile, ACC_H].sum() / op
-                slot_grad[k, U] = 2.0 * qa * sx + qb * sy - zu * depth_sum
-                slot_grad[k, V] = qb * sx + 2.0 * qc * sy - zv * depth_sum
+                slot_grad[k, U] = 2.0 * qa * sx + qb * sy - zu * slope_sum
+                slot_grad[k, V] = qb * sx + 2.0 * qc * sy - zv * slope_sum
                 slot_grad[k, QA] = -acc[tile, ACC_XX].sum()
                 slot_grad[k, QB] = -acc[tile, ACC_XY].sum()
                 slot_grad[k, QC] = -acc[tile, ACC_YY].sum()

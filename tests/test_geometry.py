@@ -91,6 +91,18 @@ def test_matrices_of_quaternions_of_any_length(values: list[float], scale: float
     np.testing.assert_allclose(geometry.matrix_from_quat_wxyz([quat * scale, quat]), [expected, expected], atol=1e-12)
 
 
+@given(twists(), twists(), st.floats(0.1, 10))
+def test_quaternions_multiply_like_their_matrices(first: np.ndarray, second: np.ndarray, scale: float) -> None:
+    R = [geometry.so3_exp(xi[:3]) for xi in (first, second)]
+    a, b = (geometry.quat_wxyz_from_matrix(one) for one in R)
+    product = geometry.quat_product_wxyz(a, b)
+    np.testing.assert_allclose(geometry.matrix_from_quat_wxyz(product), R[0] @ R[1], atol=1e-12)
+    scaled = geometry.quat_product_wxyz(scale * a, b)
+    assert np.linalg.norm(scaled) == pytest.approx(scale)  # lengths multiply
+    both = geometry.quat_product_wxyz([a, b], [b, a])
+    np.testing.assert_array_equal(both, [product, geometry.quat_product_wxyz(b, a)])
+
+
 @given(twists(), st.integers(0, 10_000))
 def test_orthonormalized_removes_small_errors(xi: np.ndarray, seed: int) -> None:
     T = geometry.se3_exp(xi)

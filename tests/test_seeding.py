@@ -88,12 +88,16 @@ def test_every_pixel_with_depth_is_covered_once(frame: tuple, smallest: int, lev
 
 @settings(max_examples=150, deadline=None)
 @given(patchy_frames())
-def test_wanted_cells_are_those_of_the_whole_frame_that_are_wanted_by_half(frame: tuple) -> None:
+def test_the_smallest_cells_that_are_wanted_by_half_are_covered_and_no_others(frame: tuple) -> None:
     colour, depth_m, wanted = frame
-    every = squares(quadtree(colour, depth_m, everywhere(depth_m), CONFIG, SIGMA))
-    share = [wanted[square][depth_m[square] > 0].mean() for square in every]
-    chosen = squares(quadtree(colour, depth_m, wanted, CONFIG, SIGMA))
-    assert chosen == [square for square, part in zip(every, share, strict=True) if part >= 0.5]
+    count = times_covered(quadtree(colour, depth_m, wanted, CONFIG, SIGMA), depth_m.shape)
+    size = CONFIG.smallest_cell_px
+    for y in range(0, depth_m.shape[0], size):
+        for x in range(0, depth_m.shape[1], size):
+            cell = (slice(y, y + size), slice(x, x + size))
+            valid = depth_m[cell] > 0
+            if valid.any():
+                assert (count[cell] == (2 * (wanted[cell] & valid).sum() >= valid.sum())).all()
 
 
 def test_nothing_wanted_or_no_depth_gives_no_cell() -> None:

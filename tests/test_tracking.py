@@ -20,7 +20,7 @@ from tgslam.render import RenderImages
 from tgslam.tracking.exposure import Exposure, IntensityMoments, fit_exposure
 from tgslam.tracking.first_order import FirstOrderTracker
 from tgslam.tracking.gauss_newton import GaussNewtonTracker
-from tgslam.tracking.lost import evidence_against
+from tgslam.tracking.lost import LostDetector
 from tgslam.tracking.motion import ConstantVelocity
 from tgslam.tracking.pyramid import finest_level, live_pyramid, model_pyramid
 from tgslam.tracking.result import TrackingResult
@@ -41,7 +41,7 @@ def source(scene: str, noise: bool = False) -> SyntheticSource:
 def map_of(scene: str, index: int, noise: bool = False) -> GaussianMap:
     """A map of one frame, refined until the error of tracking against it is tracking's own."""
     config, one = Config(), source(scene, noise)
-    mapping = replace(config.mapping, iterations=60, relaxation_depth=0.3)
+    mapping = replace(config.mapping, iterations=60)
     mapper = Mapper(one.camera, mapping, config.seeding, config.loss, np.random.default_rng(0))
     T_cw = inverse(one.pose(index))
     mapper.add_keyframe(Keyframe.from_frame(one.read(index), T_cw, Exposure(), np.eye(6)))
@@ -395,13 +395,14 @@ def test_assessing_a_pose_agrees_with_having_tracked_it():
 
 # --- lost ---
 
-GOOD = {"overlap": 0.9, "inlier_ratio": 0.9, "condition": 100.0}
+GOOD = {"overlap": 0.9, "agreement": 0.98, "inlier_ratio": 0.9, "colour_residual": 0.01, "condition": 100.0}
 
 
 @pytest.mark.parametrize(
     ("change", "word"),
     [
         ({"overlap": 0.05}, "5% of the frame meets the map"),
+        ({"agreement": 0.3}, "30% of what meets the map"),
         ({"inlier_ratio": 0.2}, "20% of the matched pixels"),
         ({"condition": 1e9}, "not determined"),
         ({"condition": float("inf")}, "not determined"),
@@ -409,15 +410,33 @@ GOOD = {"overlap": 0.9, "inlier_ratio": 0.9, "condition": 100.0}
     ],
 )
 def test_evidence_names_what_is_wrong(change, word):
-    assert evidence_against(GOOD, CONFIG) == ""
-    assert word in evidence_against(GOOD | change, CONFIG)
+    assert LostDetector(CONFIG).judge(GOOD) == ""
+    assert word in LostDetector(CONFIG).judge(GOOD | change)
+
+
+def test_colours_far_worse_than_they_were_are_suspect():
+    detector = LostDetector(CONFIG)
+    assert detector.judge(GOOD | {"colour_residual": 0.2}) == ""  # nothing is known yet of what is usual
+    detector = LostDetector(CONFIG)
+    for _ in range(5):
+        assert detector.judge(GOOD | {"colour_residual": 0.02}) == ""
+    assert detector.judge(GOOD | {"colour_residual": 0.055}) == ""  # less than three times the usual
+    assert "colours are off by 0.10" in detector.judge(GOOD | {"colour_residual": 0.1})
+    assert "colours" in detector.judge(GOOD | {"colour_residual": 0.1})  # what was refused did not become usual
+
+
+def test_a_small_colour_residual_is_never_suspect():
+    detector = LostDetector(CONFIG)
+    for _ in range(5):
+        assert detector.judge(GOOD | {"colour_residual": 0.001}) == ""
+    assert detector.judge(GOOD | {"colour_residual": 0.035}) == ""
 
 
 def test_thresholds_are_the_configs():
     lenient = replace(CONFIG, lost_overlap=0.01, lost_inlier_ratio=0.0, lost_condition=1e12)
-    assert evidence_against({"overlap": 0.02, "inlier_ratio": 0.01, "condition": 1e10}, lenient) == ""
+    assert LostDetector(lenient).judge(GOOD | {"overlap": 0.02, "inlier_ratio": 0.01, "condition": 1e10}) == ""
     strict = replace(CONFIG, lost_overlap=0.95)
-    assert "meets the map" in evidence_against(GOOD, strict)
+    assert "meets the map" in LostDetector(strict).judge(GOOD)
 
 
 def unrelated(kind: str, frame: Frame) -> Frame:

@@ -58,7 +58,7 @@ class GaussianMap:
                 setattr(self, name, grown(getattr(self, name), self.count, capacity))
             self.capacity = capacity
         for name in (*PARAMETERS, *_INT_FIELDS):
-            self._write(name, slice(self.count, count), getattr(gaussians, name))
+            self.write(name, slice(self.count, count), getattr(gaussians, name))
         self.count = count
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
@@ -66,7 +66,7 @@ class GaussianMap:
         kept = int(mask.sum())
         for name in (*PARAMETERS, *_INT_FIELDS):
             rows = runtime.to_host(getattr(self, name))[: self.count][mask]
-            self._write(name, slice(0, kept), rows)
+            self.write(name, slice(0, kept), rows)
         self.count = kept
 
     def gaussians(self) -> Gaussians:
@@ -78,7 +78,8 @@ class GaussianMap:
         """The rows in use of one parameter on the host: a view on the CPU, a copy under CUDA."""
         return runtime.to_host(getattr(self, name))[: self.count]
 
-    def _write(self, name: str, rows: slice, values: np.ndarray) -> None:
+    def write(self, name: str, rows: slice | NDArray[np.integer], values: np.ndarray) -> None:
+        """Set rows of one parameter from host values."""
         host = runtime.to_host(getattr(self, name))
         host[rows] = values
         if runtime.device() is not runtime.Device.CPU:

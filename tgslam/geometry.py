@@ -124,6 +124,14 @@ def matrix_from_quat_wxyz(quat_wxyz: ArrayLike) -> Array:
     return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
+def quat_product_wxyz(a: ArrayLike, b: ArrayLike) -> Array:
+    """Quaternion products [..., 4]: the rotation b, then a."""
+    aw, av = np.asarray(a, np.float64)[..., :1], np.asarray(a, np.float64)[..., 1:]
+    bw, bv = np.asarray(b, np.float64)[..., :1], np.asarray(b, np.float64)[..., 1:]
+    scalar = aw * bw - np.sum(av * bv, -1, keepdims=True)
+    return np.concatenate([scalar, aw * bv + bw * av + np.cross(av, bv)], -1)
+
+
 def transform_points(T_ab: ArrayLike, points_b: ArrayLike) -> Array:
     """Map points [..., 3] m from frame b to frame a."""
     T = np.asarray(T_ab, np.float64)

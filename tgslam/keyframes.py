@@ -1,4 +1,4 @@
-"""Keyframe selection by co-visibility (section 3.1)."""
+"""Keyframe selection by co-visibility (section 3.1) and baseline."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.config.schema import KeyframeConfig
+from tgslam.geometry import inverse
 from tgslam.types import Frame
 
 
@@ -19,13 +20,14 @@ class KeyframeSelector:
         self.config = config
         self._seen: NDArray[np.bool_] = np.zeros(0, bool)
         self._last_index = 0
+        self._T_cw: NDArray[np.float64] = np.eye(4)
 
-    def reset(self, frame: Frame, seen: NDArray[np.bool_]) -> None:
-        """`frame` has become a keyframe, and sees these Gaussians [N] of the map as it is now."""
-        self._seen, self._last_index = seen, frame.index
+    def reset(self, frame: Frame, T_cw: NDArray[np.float64], seen: NDArray[np.bool_]) -> None:
+        """`frame` has become a keyframe at T_cw [4, 4], and sees these Gaussians [N] of the map as it is now."""
+        self._seen, self._T_cw, self._last_index = seen, T_cw, frame.index
 
-    def cue(self, frame: Frame, seen: NDArray[np.bool_], unexplained: float) -> str:
-        """Why the frame should be a keyframe, "" if it should not.
+    def cue(self, frame: Frame, T_cw: NDArray[np.float64], seen: NDArray[np.bool_], unexplained: float) -> str:
+        """Why the frame, tracked at T_cw [4, 4], should be a keyframe, "" if it should not.
 
         seen: [N] Gaussians in the frame's view. unexplained: share of the frame's pixels that the map leaves open.
         """
@@ -35,6 +37,9 @@ class KeyframeSelector:
             return f"co-visibility: overlap {overlap:.2f}"
         if unexplained > self.config.max_unexplained:
             return f"co-visibility: {unexplained:.0%} of the frame is not in the map"
+        moved_m = float(np.linalg.norm(inverse(T_cw)[:3, 3] - inverse(self._T_cw)[:3, 3]))
+        if moved_m > self.config.max_translation * float(np.median(frame.depth_m[frame.depth_m > 0])):
+            return f"baseline: {moved_m:.2f} m"
         if frame.index - self._last_index >= self.config.max_interval:
             return "interval"
         return ""

@@ -76,7 +76,7 @@ class Rasterizer:
         self._out = runtime.zeros((rows, rasterize.OUT, LANES), lanes=True)
         self._g = runtime.zeros((rows, rasterize.G, LANES), lanes=True)
         self._state = runtime.empty((rows, 2, LANES), lanes=True)
-        self._acc = runtime.empty((self.tiles, projection.SPLAT_GRAD, LANES), lanes=True)
+        self._acc = runtime.empty((self.tiles, rasterize.ACC, LANES), lanes=True)
         self._origin = runtime.to_device([[(c % PER_ROW) * CHUNK, (c // PER_ROW) * CHUNK] for c in range(CHUNKS)])
         self._images = RenderImages(
             runtime.zeros((H, W, 3)), runtime.zeros((H, W)), runtime.zeros((H, W)), runtime.zeros((H, W, 3))
@@ -155,16 +155,6 @@ class Rasterizer:
     def tile_count(self) -> np.ndarray:
         """[capacity] int32 device array: tiles that each Gaussian touched in the last `forward`, 0 = not rendered."""
         return self._splats.tile_count
-
-    @property
-    def splat(self) -> np.ndarray:
-        """[capacity, SPLAT] device array of the last `forward`, columns as in `kernels.projection`."""
-        return self._splats.splat
-
-    @property
-    def splat_grad(self) -> np.ndarray:
-        """[capacity, SPLAT_GRAD] device array of the last `backward`."""
-        return self._splats.grad
 
     def visible(self, count: int) -> NDArray[np.bool_]:
         """[count] which Gaussians the last `forward` found inside the image."""

@@ -47,6 +47,7 @@ def start(device: Device = Device.AUTO, threads: int = 0) -> Device:
         default_fp=ti.f32,
         fast_math=True,
         offline_cache=True,
+        unrolling_limit=0,
         cpu_max_num_threads=threads,
         log_level=ti.ERROR,
     )

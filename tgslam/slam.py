@@ -108,7 +108,7 @@ class Slam:
 
     def _keyframe_cue(self, frame: Frame, result: TrackingResult) -> str:
         seen = self.tracker.rasterizer.visible(self.mapper.gaussians.count)
-        return self.selector.cue(frame, seen, result.measures["unexplained"])
+        return self.selector.cue(frame, result.T_cw, seen, 1.0 - result.measures["overlap"])
 
     def _map(self, frame: Frame, result: TrackingResult) -> None:
         keyframe = Keyframe.from_frame(frame, result.T_cw, result.exposure, result.information)
@@ -116,7 +116,7 @@ class Slam:
             self.mapper.add_keyframe(keyframe)
         self._posed.append(_Posed(frame.timestamp_s, keyframe, np.eye(4)))
         self.tracker.rasterizer.forward(self.mapper.gaussians, keyframe.T_cw)
-        self.selector.reset(frame, self.tracker.rasterizer.visible(self.mapper.gaussians.count))
+        self.selector.reset(frame, keyframe.T_cw, self.tracker.rasterizer.visible(self.mapper.gaussians.count))
 
     def _remember(self, frame: Frame, T_cw: NDArray[np.float64]) -> None:
         keyframe = self.mapper.keyframes[-1]

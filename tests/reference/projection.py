@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.geometry import matrix_from_quat_wxyz, transform_points
-from tgslam.kernels.projection import BLUR, EDGE, NEAR_M
+from tgslam.kernels.projection import BLUR, BLUR_DEPTH, EDGE, NEAR_M
 from tgslam.types import Camera, Gaussians
 
 Array = NDArray[np.float64]
@@ -74,14 +74,16 @@ def project(p: Parameters, T_cw: Array, camera: Camera) -> Splats:
     points_c = np.where(in_front[:, None], points_c, [0.0, 0.0, 1.0])
     J = jacobian(points_c, camera)
     S = camera_covariance(p, T_cw)
-    precision = np.linalg.inv(J @ S @ np.swapaxes(J, 1, 2) + BLUR * np.eye(2))
+    screen = J @ S @ np.swapaxes(J, 1, 2)
+    precision = np.linalg.inv(screen + BLUR * np.eye(2))
+    regression = np.linalg.inv(screen + BLUR_DEPTH * np.eye(2))
     depth_uv = (S @ np.swapaxes(J, 1, 2))[:, 2, :]  # cov(z, uv)
     return Splats(
         uv=points_c[:, :2] / points_c[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy],
         precision=precision,
         opacity=sigmoid(p["opacity_logit"]),
         depth=points_c[:, 2],
-        slope=np.einsum("ni,nij->nj", depth_uv, precision),
+        slope=np.einsum("ni,nij->nj", depth_uv, regression),
         colour=p["colour"],
         embedding=sigmoid(p["embedding"]),
         in_front=in_front,

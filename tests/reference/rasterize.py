@@ -65,7 +65,8 @@ def render(p: Parameters, T_cw: Array, camera: Camera, decisions: Decisions | No
     raw = raw_alpha(splats, offsets)
     decisions = decisions or decide(splats, raw)
     alpha = np.where(decisions.drawn, np.minimum(raw, ALPHA_MAX), 0.0)
-    depth_at_pixel = splats.depth[:, None, None] + np.einsum("nhwi,ni->nhw", offsets, splats.slope)
+    rise = np.einsum("nhwi,ni->nhw", offsets, splats.slope)
+    depth_at_pixel = splats.depth[:, None, None] + rise + rise**2 / splats.depth[:, None, None]
     weight = np.zeros_like(alpha)
     transmittance = np.ones((camera.height, camera.width))
     for i in decisions.order:

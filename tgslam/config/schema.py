@@ -14,7 +14,7 @@ def setting(
     choices: tuple[str, ...] = (),
     min_items: int = 0,
 ) -> Any:
-    """A dataclass field with its allowed range [low, high] or choices, which `loader` checks; of a list, of each item."""
+    """A dataclass field with its allowed range [low, high] or choices (of a list: of each item), for `loader`."""
     metadata = {"low": low, "high": high, "choices": choices, "min_items": min_items}
     if isinstance(default, tuple):
         return dataclasses.field(default_factory=lambda: default, metadata=metadata)
@@ -83,8 +83,8 @@ class TrackingConfig:
     sigma_colour: float = setting(0.05, 1e-4, 1.0)  # intensity residual of weight 1
     sigma_gradient: float = setting(0.02, 1e-4, 1.0)  # gradient residual of weight 1, 1/px
     weight_depth: float = setting(1.0, 0.0, 100.0)
-    weight_colour: float = setting(0.1, 0.0, 100.0)
-    weight_gradient: float = setting(0.1, 0.0, 100.0)
+    weight_colour: float = setting(0.3, 0.0, 100.0)
+    weight_gradient: float = setting(0.3, 0.0, 100.0)
     max_distance_sigmas: float = setting(15.0, 1.0, 1000.0)  # depth residuals beyond are no match
     exposure: str = setting("gain", choices=("none", "gain", "gain_bias"))  # a frame's brightness against the map
     min_opacity: float = setting(0.8, 0.0, 1.0)  # model pixels less covered are not used
@@ -92,6 +92,9 @@ class TrackingConfig:
     first_order_rate: float = setting(0.001, 1e-6, 1.0)  # Adam step, rad and m
     lost_inlier_ratio: float = setting(0.3, 0.0, 1.0)  # fewer matched pixels with a residual below 3 sigma: lost
     lost_overlap: float = setting(0.1, 0.0, 1.0)  # fewer live pixels that meet the map: lost
+    lost_agreement: float = setting(0.6, 0.0, 1.0)  # fewer of those with the map's depth: lost
+    lost_colour_residual: float = setting(0.04, 0.0, 1.0)  # a mean intensity residual up to this is never suspect
+    lost_colour_ratio: float = setting(3.0, 1.0, 1000.0)  # above it, more than this times the usual one is: lost
     lost_condition: float = setting(1e7, 1.0, 1e15)  # worse conditioned normal equations: lost
 
 
@@ -101,6 +104,7 @@ class KeyframeConfig:
 
     min_overlap: float = setting(0.85, 0.0, 1.0)  # Gaussians seen by frame and last keyframe, intersection over union
     max_unexplained: float = setting(0.08, 0.0, 1.0)  # share of pixels with depth that the map does not cover
+    max_translation: float = setting(0.1, 0.0, 100.0)  # since the last keyframe, relative to the median depth
     max_interval: int = setting(30, 1, 100_000)  # frames
 
 
@@ -129,6 +133,7 @@ class MappingConfig:
     refine_poses: bool = setting(True)
     insert_opacity: float = setting(0.6, 0.0, 1.0)  # the map does not explain a pixel that it covers less than this
     insert_sigmas: float = setting(8.0, 0.0, 1000.0)  # nor one whose surface stands this far in front of the map's
+    coarse_factor: float = setting(2.5, 1.0, 100.0)  # Gaussians this much larger than needed are seeded anew, finer
     prune_opacity: float = setting(0.05, 0.0, 1.0)
     prune_weight_px: float = setting(0.05, 0.0, 1000.0)  # blend weight summed over the window's pixels
     rate_mean_px: float = setting(0.02, 0.0, 10.0)  # Adam steps: pixels of the median depth
@@ -138,7 +143,6 @@ class MappingConfig:
     rate_colour: float = setting(0.01, 0.0, 1.0)  # only with optimizer: adam
     rate_pose: float = setting(0.0003, 0.0, 1.0)  # rad and m
     relaxation: float = setting(0.7, 0.0, 1.9)  # of colours; 1 = the full step
-    relaxation_depth: float = setting(0.3, 0.0, 1.9)  # of depths: below 1, noisy views average
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,16 @@ from tgslam import images, runtime
 from tgslam.config.schema import LossConfig, MappingConfig, SeedingConfig
 from tgslam.depth import filled
 from tgslam.gaussian_map import GaussianMap
-from tgslam.geometry import transform_points
+from tgslam.geometry import inverse, matrix_from_quat_wxyz, transform_points
+from tgslam.mapping.fusion import block_centre, depth_pyramid, fused_depth, sample, turned
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.refinement import Refiner
-from tgslam.mapping.seeding import quadtree, seed
+from tgslam.mapping.seeding import cell_sizes, quadtree, seed
 from tgslam.types import Camera
 
+_NEAR_M = 0.05
+_MIN_COSINE = 0.1  # a surface more grazing than this says nothing of the depth beside
+_MAX_SLANT = 0.1  # nor one whose depth changes by more within a block
 _MIN_VIEWS = 3  # a Gaussian is judged invisible only after so many views
 
 
@@ -29,17 +33,26 @@ class Mapper:
         self.gaussians = GaussianMap()
         self.keyframes: list[Keyframe] = []
         self.refiner = Refiner(camera, mapping, loss)
+        self.guessed = np.zeros(0, bool)  # [N] seeded where no depth was measured
+        self.information = np.zeros(0)  # [N] 1/m^2, what is known of a Gaussian's depth
         self.support = np.zeros(0, np.int32)  # [N] keyframes whose depth agrees with the Gaussian
         self.conflict = np.zeros(0, np.int32)  # [N] keyframes that see through it
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
-        """Take in a keyframe: insert, weigh the evidence, prune, refine."""
+        """Take in a keyframe: weigh the evidence, clear what it knows better, insert, refine the window."""
         self.keyframes.append(keyframe)
+        surface = _Surface(
+            keyframe, self.camera, self.gaussians, self.config.insert_sigmas * self.loss.depth_sigma_per_m2
+        )
+        self.conflict += surface.seen_through
+        self.support += surface.supported
+        kept = ~(self.guessed & surface.measured) & ~self._too_coarse(keyframe, surface)
+        self._keep(kept)
+        self._fuse(keyframe, surface, kept)
         self._insert(keyframe)
-        self._weigh(keyframe)
-        self._prune()
         for view in self._schedule(self.config.iterations):
             self.refiner.step(self.gaussians, view, move_pose=self._may_move(view))
+        self._prune()
 
     def finish(self) -> None:
         """The final pass: every keyframe in turn, in random order, poses fixed."""
@@ -50,57 +63,111 @@ class Mapper:
 
     def _insert(self, keyframe: Keyframe) -> None:
         """Seed Gaussians where the map is open; where no depth was measured, at a guessed one."""
-        colour, measured_m = keyframe.colour(), keyframe.depth_m()
+        measured_m = keyframe.depth_m()
         wanted = self._unexplained(keyframe, measured_m)
         depth_m = filled(measured_m)
-        exposure = keyframe.exposure
-        cells = quadtree(
-            exposure.gain * colour + exposure.bias, depth_m, wanted, self.seeding, self.loss.depth_sigma_per_m2
-        )
+        colour = keyframe.exposure.gain * keyframe.colour() + np.float32(keyframe.exposure.bias)
+        cells = quadtree(colour, depth_m, wanted, self.seeding, self.loss.depth_sigma_per_m2)
         normals = images.normals(runtime.to_device(depth_m), self.camera, sigma_per_m2=self.loss.depth_sigma_per_m2)
         born = len(self.keyframes) - 1
         new = seed(cells, runtime.to_host(normals), self.camera, keyframe.T_cw, born, self.seeding)
         self.gaussians.append(new)
         self.refiner.append(len(new))
+        guessed = measured_m[np.rint(cells.v).astype(int), np.rint(cells.u).astype(int)] <= 0
+        self.guessed = np.concatenate([self.guessed, guessed])
+        information = np.where(guessed, 0.0, cells.size_px**2 / self._sigma_m(cells.depth_m) ** 2)
+        self.information = np.concatenate([self.information, information])
         self.support = np.concatenate([self.support, np.zeros(len(new), np.int32)])
         self.conflict = np.concatenate([self.conflict, np.zeros(len(new), np.int32)])
+
+    def _fuse(self, keyframe: Keyframe, surface: _Surface, kept: NDArray[np.bool_]) -> None:
+        """Average the keyframe's depth and normals into the Gaussians that it supports."""
+        use = surface.supported & kept
+        rows = np.flatnonzero(use[kept])
+        if not len(rows):
+            return
+        depth_m = keyframe.depth_m()
+        at = use[surface.inside]
+        u, v, z = surface.u[at], surface.v[at], surface.z[use]
+        means, scales = self.gaussians.host("mean"), self.gaussians.host("log_scale")
+        width_px = np.exp(np.sort(scales[rows], -1)[:, 1]) * self.camera.fx / (z * self.seeding.overlap)
+        measured, block_px = sample(depth_pyramid(depth_m, self.seeding.cell_levels + 1), u, v, width_px)
+        rotations = self.gaussians.host("quat_wxyz")[rows].astype(np.float64)
+        normals_c = matrix_from_quat_wxyz(rotations)[:, :, 2] @ keyframe.T_cw[:3, :3].T
+        centres = block_centre(u, block_px), block_centre(v, block_px)
+        measured *= self._slant(normals_c, centres, (surface.exact_u[use], surface.exact_v[use]))
+        agrees = (measured > 0) & (np.abs(measured - z) < self.config.insert_sigmas * self._sigma_m(z))
+        evidence = np.where(agrees, block_px**2 / self._sigma_m(z) ** 2, 0.0)
+        fused, self.information[rows], gain = fused_depth(z, self.information[rows], measured, evidence)
+        T_wc = inverse(keyframe.T_cw)
+        normals = images.normals(runtime.to_device(depth_m), self.camera, sigma_per_m2=self.loss.depth_sigma_per_m2)
+        towards = runtime.to_host(normals)[v, u].astype(np.float64) @ T_wc[:3, :3].T
+        self.gaussians.write("mean", rows, T_wc[:3, 3] + (fused / z)[:, None] * (means[rows] - T_wc[:3, 3]))
+        self.gaussians.write("quat_wxyz", rows, turned(rotations, towards, gain))
+
+    def _slant(
+        self,
+        normals_c: NDArray[np.float64],
+        seen_at: tuple[NDArray[np.float64], NDArray[np.float64]],
+        wanted_at: tuple[NDArray[np.float64], NDArray[np.float64]],
+    ) -> NDArray[np.float64]:
+        """Depth at one pixel over depth at another [N], on planes with those normals [N, 3]; 1 where it is unclear."""
+        camera = self.camera
+        seen, wanted = (
+            normals_c[:, 0] * (u - camera.cx) / camera.fx
+            + normals_c[:, 1] * (v - camera.cy) / camera.fy
+            + normals_c[:, 2]
+            for u, v in (seen_at, wanted_at)
+        )
+        ratio = seen / np.where(np.abs(wanted) > _MIN_COSINE, wanted, np.inf)
+        return np.where(np.abs(ratio - 1.0) < _MAX_SLANT, ratio, 1.0)
+
+    def _sigma_m(self, depth_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Standard deviation of the sensor's depth."""
+        return self.loss.depth_sigma_per_m2 * depth_m**2
+
+    def _too_coarse(self, keyframe: Keyframe, surface: _Surface) -> NDArray[np.bool_]:
+        """[N] Gaussians on the keyframe's surface that are much larger in it than it would seed there today.
+
+        They were seeded from afar. Only those well inside the image go, so that the keyframe fills all that they leave.
+        """
+        colour, depth_m = keyframe.colour(), keyframe.depth_m()
+        sizes = cell_sizes(colour, depth_m, self.seeding, self.loss.depth_sigma_per_m2)
+        wanted_px = np.zeros(len(surface.z))
+        wanted_px[surface.inside] = sizes[surface.v, surface.u]
+        in_plane = np.sort(np.exp(self.gaussians.host("log_scale")), axis=-1)[:, 1]
+        std_px = in_plane * self.camera.fx / surface.z
+        margin = 2.0 * std_px[surface.inside]
+        whole = np.zeros(len(surface.z), bool)
+        whole[surface.inside] = (np.minimum(surface.u, self.camera.width - 1 - surface.u) > margin) & (
+            np.minimum(surface.v, self.camera.height - 1 - surface.v) > margin
+        )
+        return surface.supported & whole & (std_px > self.config.coarse_factor * self.seeding.overlap * wanted_px)
 
     def _unexplained(self, keyframe: Keyframe, depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
         """[H, W] pixels that the map leaves open, or in front of whose surface the camera sees another one."""
         rendered = self.refiner.rasterizer.render(self.gaussians, keyframe.T_cw)
         sigma_m = self.loss.depth_sigma_per_m2 * depth_m**2
-        both = (rendered.depth_m > 0) & (depth_m > 0)
-        in_front = both & (depth_m < rendered.depth_m - self.config.insert_sigmas * sigma_m)
+        # The nearest surface around decides: where the map's depth bleeds over an edge, the edge is known all the same
+        around = np.where(rendered.depth_m > 0, rendered.depth_m, np.float32(np.inf))
+        nearest = cv2.erode(around, np.ones((5, 5)), borderValue=np.inf)
+        in_front = np.isfinite(nearest) & (depth_m > 0) & (depth_m < nearest - self.config.insert_sigmas * sigma_m)
         return (rendered.opacity < self.config.insert_opacity) | in_front
-
-    def _weigh(self, keyframe: Keyframe) -> None:
-        """Count for each Gaussian whether the keyframe's depth supports it or looks through it."""
-        depth_m = keyframe.depth_m()
-        # The nearest measurement around decides, so that an edge pixel off by one does not speak against a surface
-        nearest = cv2.erode(np.where(depth_m > 0, depth_m, np.inf), np.ones((3, 3)), borderValue=np.inf)
-        x = transform_points(keyframe.T_cw, self.gaussians.host("mean"))
-        z = np.maximum(x[:, 2], 1e-3)
-        u = np.rint(self.camera.fx * x[:, 0] / z + self.camera.cx)
-        v = np.rint(self.camera.fy * x[:, 1] / z + self.camera.cy)
-        inside = (x[:, 2] > 0.05) & (u >= 0) & (v >= 0) & (u < self.camera.width) & (v < self.camera.height)
-        surface = np.full(len(x), np.inf)
-        surface[inside] = nearest[v[inside].astype(int), u[inside].astype(int)]
-        known = np.isfinite(surface)
-        margin = self.config.insert_sigmas * self.loss.depth_sigma_per_m2 * np.where(known, surface, 0.0) ** 2
-        self.conflict += known & (z < surface - margin)
-        self.support += known & (np.abs(z - surface) <= margin)
 
     def _prune(self) -> None:
         """Remove the transparent, the floaters that keyframes see through, and what never shows."""
         opacity = 1.0 / (1.0 + np.exp(-self.gaussians.host("opacity_logit")))
         hidden = (self.refiner.views >= _MIN_VIEWS) & (self.refiner.contribution < self.config.prune_weight_px)
         floating = (self.conflict >= 2) & (self.conflict > self.support)
-        keep = (opacity >= self.config.prune_opacity) & ~hidden & ~floating
-        keep &= np.isfinite(self.gaussians.host("mean")).all(-1)
+        finite = np.isfinite(self.gaussians.host("mean")).all(-1)
+        self._keep((opacity >= self.config.prune_opacity) & ~hidden & ~floating & finite)
+
+    def _keep(self, keep: NDArray[np.bool_]) -> None:
         if keep.all():
             return
         self.gaussians.keep(keep)
         self.refiner.keep(keep)
+        self.guessed, self.information = self.guessed[keep], self.information[keep]
         self.support, self.conflict = self.support[keep], self.conflict[keep]
 
     def _schedule(self, iterations: int) -> list[Keyframe]:
@@ -116,3 +183,25 @@ class Mapper:
         """The first keyframe holds the world frame; earlier ones outside the window are anchors."""
         window = self.keyframes[-self.config.window :]
         return self.config.refine_poses and keyframe is not self.keyframes[0] and any(keyframe is k for k in window)
+
+
+class _Surface:
+    """How the map's Gaussians stand to the surface that a keyframe's sensor saw."""
+
+    def __init__(self, keyframe: Keyframe, camera: Camera, gaussians: GaussianMap, margin_per_m2: float) -> None:
+        depth_m = keyframe.depth_m()
+        # The nearest measurement around decides, so that an edge pixel off by one does not speak against a surface
+        nearest = cv2.erode(np.where(depth_m > 0, depth_m, np.inf), np.ones((3, 3)), borderValue=np.inf)
+        x = transform_points(keyframe.T_cw, gaussians.host("mean"))
+        self.z = np.maximum(x[:, 2], 1e-3)  # [N] m
+        self.exact_u = camera.fx * x[:, 0] / self.z + camera.cx  # [N] px
+        self.exact_v = camera.fy * x[:, 1] / self.z + camera.cy  # [N] px
+        u, v = np.rint(self.exact_u), np.rint(self.exact_v)
+        self.inside = (x[:, 2] > _NEAR_M) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)  # [N]
+        self.u, self.v = u[self.inside].astype(int), v[self.inside].astype(int)  # [inside] px
+        surface = np.full(len(x), np.inf)
+        surface[self.inside] = nearest[self.v, self.u]
+        self.measured = np.isfinite(surface)  # [N] there is depth where the Gaussian projects to
+        margin = margin_per_m2 * np.where(self.measured, surface, 0.0) ** 2
+        self.seen_through = self.measured & (self.z < surface - margin)  # [N]
+        self.supported = self.measured & (np.abs(self.z - surface) <= margin)  # [N]

@@ -19,11 +19,10 @@ from tgslam.types import Camera
 from tgslam.vector_adam import VectorAdam
 
 _GEOMETRY = {"mean": 3, "log_scale": 3, "quat_wxyz": 4, "opacity_logit": 0}
-_MAX_SHIFT_SIGMAS = 3.0  # a depth step is at most this much of the sensor's noise
 
 
 class Refiner:
-    """One view at a time: render, compare, step. Colours and depths relax, the rest moves by Adam."""
+    """One view at a time: render, compare, step. Colours relax, the rest moves by Adam."""
 
     def __init__(self, camera: Camera, config: MappingConfig, loss: LossConfig) -> None:
         self.config, self.loss = config, loss
@@ -67,9 +66,7 @@ class Refiner:
             rendered.colour, rendered.depth, rendered.opacity, observation, self.loss, gain, bias,
             workspace=self._workspace,
         )  # fmt: skip
-        pixels, depths = max(result.parts["pixels"], 1.0), max(result.parts["depths"], 1.0)
-        scale_colour = self.loss.weight_pho * self.loss.weight_l1 / (3.0 * pixels)
-        scale_depth = self.loss.weight_geo / depths
+        scale_colour = self.loss.weight_pho * self.loss.weight_l1 / (3.0 * max(result.parts["pixels"], 1.0))
         if self._gradient.mean.shape[0] != gaussians.capacity:
             self._gradient = MapGradient.zeros(gaussians.capacity)
         else:
@@ -79,13 +76,13 @@ class Refiner:
             colour_weight=result.w_colour, depth_weight=result.w_depth,
         )  # fmt: skip
         g_pose = self.rasterizer.backward(gaussians, g, self._gradient)
-        self._update_map(gaussians, keyframe, scale_colour, scale_depth)
+        self._update_map(gaussians, scale_colour)
         if move_pose:
             adam = self._pose_steps.setdefault(keyframe.index, VectorAdam([self.config.rate_pose] * 6))
             keyframe.T_cw = orthonormalized(se3_exp(adam.step(g_pose)) @ keyframe.T_cw)
         return result.value
 
-    def _update_map(self, gaussians: GaussianMap, keyframe: Keyframe, scale_colour: float, scale_depth: float) -> None:
+    def _update_map(self, gaussians: GaussianMap, scale_colour: float) -> None:
         n, gradient = gaussians.count, self._gradient
         names = list(self.adam.learning_rates)
         self.adam.step(
@@ -95,10 +92,8 @@ class Refiner:
         )
         if self.config.optimizer == "relaxation":
             relaxation.relax(
-                n, self.rasterizer.tile_count, self.rasterizer.splat_grad, self.rasterizer.splat,
-                runtime.to_device(keyframe.T_cw[:3].reshape(12)), self.config.relaxation, self.config.relaxation_depth,
-                scale_colour / self.loss.charbonnier_colour, 0.1 * scale_depth / self.loss.depth_sigma_per_m2**2,
-                _MAX_SHIFT_SIGMAS * self.loss.depth_sigma_per_m2, gaussians.colour, gaussians.mean,
+                n, self.rasterizer.tile_count, gradient.colour, gradient.curvature, self.config.relaxation,
+                scale_colour / self.loss.charbonnier_colour, gaussians.colour,
             )  # fmt: skip
         weight_px = runtime.to_host(gradient.curvature)[:n, 0] * (self.loss.charbonnier_colour / scale_colour)
         self.contribution = np.maximum(self.contribution, weight_px)

@@ -55,6 +55,31 @@ def _is_plain_and_planar(
     return complete & plain & (residual_rms < config.planar_sigmas * sigma_per_m2)
 
 
+def _padded(image: NDArray[Any], largest: int) -> NDArray[Any]:
+    """The image with zeros at the right and bottom, so that the largest cells tile it."""
+    padding = [(0, -image.shape[0] % largest), (0, -image.shape[1] % largest)]
+    return np.pad(image, padding + [(0, 0)] * (image.ndim - 2))
+
+
+def _largest(config: SeedingConfig) -> int:
+    return config.smallest_cell_px * 2 ** (config.cell_levels - 1)
+
+
+def cell_sizes(
+    colour: NDArray[np.floating], depth_m: NDArray[np.floating], config: SeedingConfig, sigma_per_m2: float
+) -> NDArray[np.int32]:
+    """The quadtree of a frame: the size in pixels of the cell at each pixel [H, W], as large as the surface allows."""
+    size = _largest(config)
+    depth, rgb = _padded(depth_m.astype(np.float64), size), _padded(colour.astype(np.float64), size)
+    sizes = np.full(depth.shape, config.smallest_cell_px, np.int32)
+    while size > config.smallest_cell_px:
+        cells = _is_plain_and_planar(rgb, depth, size, config, sigma_per_m2)
+        whole = np.repeat(np.repeat(cells, size, 0), size, 1)
+        sizes = np.where(whole & (sizes < size), size, sizes)
+        size //= 2
+    return sizes[: depth_m.shape[0], : depth_m.shape[1]]
+
+
 def quadtree(
     colour: NDArray[np.floating],
     depth_m: NDArray[np.floating],
@@ -64,39 +89,45 @@ def quadtree(
 ) -> Cells:
     """Cells that cover the `wanted` pixels [H, W] with depth, from the largest size down to `smallest_cell_px`.
 
-    A cell counts as wanted if at least half of its pixels with depth are.
+    A cell that is wanted only in part is split; of the smallest ones, those are used that are wanted in half or more of
+    their pixels with depth.
     """
-    found: list[list[NDArray[np.floating]]] = []
-    size = config.smallest_cell_px * 2 ** (config.cell_levels - 1)
-    open_cells = np.ones((-(-depth_m.shape[0] // size), -(-depth_m.shape[1] // size)), bool)
-    padding = [(0, -depth_m.shape[0] % size), (0, -depth_m.shape[1] % size)]
-    depth = np.pad(depth_m.astype(np.float64), padding)
-    rgb = np.pad(colour.astype(np.float64), [*padding, (0, 0)])
-    need = np.pad(wanted, padding)
+    size = _largest(config)
+    desired = _padded(cell_sizes(colour, depth_m, config, sigma_per_m2), size)
+    depth, rgb = _padded(depth_m.astype(np.float64), size), _padded(colour.astype(np.float64), size)
+    need = _padded(wanted & (depth_m > 0), size)
+    open_cells = np.ones((depth.shape[0] // size, depth.shape[1] // size), bool)
+    found = []
     while True:
         valid = _blocks(depth, size) > 0
-        count = valid.sum(-1)
-        smallest = size <= config.smallest_cell_px
-        leaf = open_cells & (count > 0)
-        if not smallest:
-            leaf &= _is_plain_and_planar(rgb, depth, size, config, sigma_per_m2)
-        use = leaf & (2 * (_blocks(need, size) & valid).sum(-1) >= np.maximum(count, 1))
-        row, column = np.nonzero(use)
-        weight = valid[use] / count[use][:, None]
-        centre = (size - 1) / 2
-        within_y, within_x = np.divmod(np.arange(size * size), size)
-        found.append([
-            column * size + (weight @ within_x if smallest else np.full(len(column), centre)),
-            row * size + (weight @ within_y if smallest else np.full(len(row), centre)),
-            np.full(len(row), float(size)),
-            1.0 / (weight / np.where(valid[use], _blocks(depth, size)[use], 1.0)).sum(-1),
-            np.einsum("np,npc->nc", weight, _blocks(rgb, size)[use]),
-        ])  # fmt: skip
-        if smallest:
+        count, needed = valid.sum(-1), _blocks(need, size).sum(-1)
+        if size > config.smallest_cell_px:
+            use = open_cells & (desired[::size, ::size] >= size) & (needed == count) & (count > 0)
+        else:
+            use = open_cells & (2 * needed >= count) & (count > 0)
+        found.append(_means(use, valid[use], depth, rgb, size))
+        if size <= config.smallest_cell_px:
             break
-        open_cells = np.repeat(np.repeat(open_cells & ~leaf, 2, 0), 2, 1)
+        open_cells = np.repeat(np.repeat(open_cells & ~use, 2, 0), 2, 1)
         size //= 2
     return Cells(*(np.concatenate(column) for column in zip(*found, strict=True)))
+
+
+def _means(
+    use: NDArray[np.bool_], valid: NDArray[np.bool_], depth: NDArray[np.floating], rgb: NDArray[np.floating], size: int
+) -> tuple[NDArray[np.float64], ...]:
+    """The columns of `Cells` for the blocks [rows, columns] in `use`, from their valid pixels [N, size * size]."""
+    row, column = np.nonzero(use)
+    weight = valid / valid.sum(-1, keepdims=True)
+    within_y, within_x = np.divmod(np.arange(size * size), size)
+    inverse_z = weight / np.where(valid, _blocks(depth, size)[use], 1.0)  # a plane's mean depth is that of the centre
+    return (
+        column * size + weight @ within_x,
+        row * size + weight @ within_y,
+        np.full(len(row), float(size)),
+        1.0 / inverse_z.sum(-1),
+        np.einsum("np,npc->nc", weight, _blocks(rgb, size)[use]),
+    )
 
 
 def seed(

@@ -14,7 +14,7 @@ from tgslam.geometry import adjoint, inverse, se3_exp
 from tgslam.kernels import alignment
 from tgslam.render import Rasterizer
 from tgslam.tracking.exposure import Exposure, IntensityMoments, fit_exposure
-from tgslam.tracking.lost import evidence_against
+from tgslam.tracking.lost import LostDetector
 from tgslam.tracking.pyramid import LiveLevel, ModelLevel, finest_level, live_pyramid, model_pyramid
 from tgslam.tracking.result import TrackingResult
 from tgslam.types import Camera, Frame
@@ -46,6 +46,7 @@ class GaussNewtonTracker:
         self.config, self.loss = config, loss
         self.first = finest_level(camera, config.finest_width_px)
         self.camera = camera
+        self.detector = LostDetector(config)
         self.rasterizer = Rasterizer(camera)
 
     def track(
@@ -73,15 +74,15 @@ class GaussNewtonTracker:
         information = adjoint(T_ml).T @ last.A @ adjoint(T_ml)
         measures = {
             "inlier_ratio": last.inliers / max(last.matched, 1.0),
-            "overlap": last.matched / max(last.live_pixels, 1.0),
-            "unexplained": 1.0 - last.candidates / max(last.live_pixels, 1.0),
+            "overlap": last.candidates / max(last.live_pixels, 1.0),
+            "agreement": last.matched / max(last.candidates, 1.0),
             "depth_residual_sigmas": last.depth_residual,
             "colour_residual": last.colour_residual,
             "condition": float(np.linalg.cond(information)),
             "gain": exposure.gain,
             "bias": exposure.bias,
         }
-        message = evidence_against(measures, self.config)
+        message = self.detector.judge(measures)
         return TrackingResult(T_cw, exposure, information, bool(message), message, measures)
 
     def _model(self, gaussians: GaussianMap, T_cw: NDArray[np.float64]) -> list[ModelLevel]:

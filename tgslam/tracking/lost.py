@@ -2,19 +2,50 @@
 
 from __future__ import annotations
 
+from collections import deque
+
+import numpy as np
+
 from tgslam.config.schema import TrackingConfig
 
+_HISTORY = 30  # tracked frames whose colour residual says what is usual here
+_MIN_HISTORY = 3
 
-def evidence_against(measures: dict[str, float], config: TrackingConfig) -> str:
-    """What speaks against a pose, "" if nothing does.
 
-    measures: overlap (live pixels that meet the map), inlier_ratio (of them, within three sigma), condition (of the
-    pose's information matrix).
+class LostDetector:
+    """Weighs what a solver measured of its result against fixed bounds and against the frames before.
+
+    Alignment finds some surface that fits in almost any image; what gives a wrong place away is that much of what
+    should meet does not (`agreement`), and that the colours are off by far more than they were.
     """
-    if measures["overlap"] < config.lost_overlap:
-        return f"only {measures['overlap']:.0%} of the frame meets the map"
-    if measures["inlier_ratio"] < config.lost_inlier_ratio:
-        return f"only {measures['inlier_ratio']:.0%} of the matched pixels lie within three sigma"
-    if not measures["condition"] < config.lost_condition:
-        return f"the pose is not determined (condition number {measures['condition']:.1e})"
-    return ""
+
+    def __init__(self, config: TrackingConfig) -> None:
+        self.config = config
+        self._colour_residuals: deque[float] = deque(maxlen=_HISTORY)
+
+    def judge(self, measures: dict[str, float]) -> str:
+        """What speaks against a result, "" if nothing does; then its residual joins the history.
+
+        measures: overlap (share of the live pixels that meet the map), agreement (of those, with like depth),
+        inlier_ratio (of those, within three sigma of the surface), colour_residual (intensity), condition (of the
+        pose's information matrix).
+        """
+        config, usual = self.config, self._usual_colour_residual()
+        if measures["overlap"] < config.lost_overlap:
+            return f"only {measures['overlap']:.0%} of the frame meets the map"
+        if measures["agreement"] < config.lost_agreement:
+            return f"only {measures['agreement']:.0%} of what meets the map has its depth"
+        if measures["inlier_ratio"] < config.lost_inlier_ratio:
+            return f"only {measures['inlier_ratio']:.0%} of the matched pixels lie within three sigma"
+        if measures["colour_residual"] > usual:
+            return f"the colours are off by {measures['colour_residual']:.2f}, more than {usual:.2f}"
+        if not measures["condition"] < config.lost_condition:
+            return f"the pose is not determined (condition number {measures['condition']:.1e})"
+        self._colour_residuals.append(measures["colour_residual"])
+        return ""
+
+    def _usual_colour_residual(self) -> float:
+        if len(self._colour_residuals) < _MIN_HISTORY:
+            return np.inf
+        median = float(np.median(self._colour_residuals))
+        return max(self.config.lost_colour_ratio * median, self.config.lost_colour_residual)
