@@ -473,7 +473,7 @@ def test_an_empty_map_loses_every_frame(solver):
     config = replace(CONFIG, solver=solver, first_order_iterations=(2, 2))
     result = tracker(config).track(one.read(0), GaussianMap(), np.eye(4), Exposure())
     assert result.lost and "meets the map" in result.message
-    assert result.measures["unexplained"] == 1.0
+    assert result.measures["overlap"] == 0.0
     np.testing.assert_allclose(result.T_cw, np.eye(4), atol=1e-6)
 
 

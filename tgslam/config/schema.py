@@ -89,7 +89,7 @@ class TrackingConfig:
     exposure: str = setting("gain", choices=("none", "gain", "gain_bias"))  # a frame's brightness against the map
     min_opacity: float = setting(0.8, 0.0, 1.0)  # model pixels less covered are not used
     first_order_iterations: tuple[int, ...] = setting((20, 20), 1, 1000, min_items=1)  # Adam steps, likewise
-    first_order_rate: float = setting(0.001, 1e-6, 1.0)  # Adam step, rad and m
+    first_order_rate: float = setting(0.002, 1e-6, 1.0)  # Adam step, rad and m
     lost_inlier_ratio: float = setting(0.3, 0.0, 1.0)  # fewer matched pixels with a residual below 3 sigma: lost
     lost_overlap: float = setting(0.1, 0.0, 1.0)  # fewer live pixels that meet the map: lost
     lost_agreement: float = setting(0.6, 0.0, 1.0)  # fewer of those with the map's depth: lost
@@ -136,7 +136,7 @@ class MappingConfig:
     coarse_factor: float = setting(2.5, 1.0, 100.0)  # Gaussians this much larger than needed are seeded anew, finer
     prune_opacity: float = setting(0.05, 0.0, 1.0)
     prune_weight_px: float = setting(0.05, 0.0, 1000.0)  # blend weight summed over the window's pixels
-    rate_mean_px: float = setting(0.02, 0.0, 10.0)  # Adam steps: pixels of the median depth
+    rate_mean_px: float = setting(0.15, 0.0, 10.0)  # Adam steps: pixels of the median depth
     rate_scale: float = setting(0.005, 0.0, 1.0)  # in log scale
     rate_rotation: float = setting(0.002, 0.0, 1.0)
     rate_opacity: float = setting(0.03, 0.0, 10.0)  # in logit
