@@ -72,6 +72,40 @@ def precision_times_rows(ax: ti.template(), ay: ti.template(), blur):
     return (ay.cross(n) + blur * ax) * inv_det, (n.cross(ax) + blur * ay) * inv_det
 
 
+@ti.func
+def axes_in_camera(R: ti.template(), Rq: ti.template(), s: ti.template()):
+    """M = R Rq diag(s): the Gaussian's axes in the camera frame, as long as its standard deviations."""
+    M = R @ Rq
+    for k in ti.static(range(3)):
+        for r in ti.static(range(3)):
+            M[r, k] *= s[k]
+    return M
+
+
+@ti.func
+def quat_gradient(H: ti.template(), q: ti.template()):
+    """Gradient by the unit quaternion q, given that by its rotation matrix."""
+    w, a, b, c = q[0], q[1], q[2], q[3]
+    skew = ti.Vector([H[2, 1] - H[1, 2], H[0, 2] - H[2, 0], H[1, 0] - H[0, 1]])
+    ab, ac, bc = H[0, 1] + H[1, 0], H[0, 2] + H[2, 0], H[1, 2] + H[2, 1]
+    return 2.0 * ti.Vector(
+        [
+            a * skew[0] + b * skew[1] + c * skew[2],
+            w * skew[0] + b * ab + c * ac - 2.0 * a * (H[1, 1] + H[2, 2]),
+            w * skew[1] + a * ab + c * bc - 2.0 * b * (H[0, 0] + H[2, 2]),
+            w * skew[2] + a * ac + b * bc - 2.0 * c * (H[0, 0] + H[1, 1]),
+        ]
+    )
+
+
+@ti.func
+def jacobian_gradient(g, focal, ratio, limited, inv_z2):
+    """Gradients by x (or y) and by z of the Jacobian entry -limited focal / z, times g (constant where limited)."""
+    by_z = g * focal * limited * inv_z2
+    free = ratio == limited
+    return ti.select(free, -g * focal * inv_z2, 0.0), ti.select(free, 2.0 * by_z, by_z)
+
+
 @ti.kernel
 def project(
     count: ti.i32,
@@ -98,12 +132,8 @@ def project(
         if x[2] > NEAR_M:
             fx, fy = camera[0], camera[1]
             q = ti.Vector([quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3]]).normalized()
-            L = rotation_from_quat(q[0], q[1], q[2], q[3])
-            for k in ti.static(range(3)):
-                s = ti.exp(log_scale[i, k])
-                for r in ti.static(range(3)):
-                    L[r, k] *= s
-            M = R @ L
+            s = ti.Vector([ti.exp(log_scale[i, k]) for k in range(3)])
+            M = axes_in_camera(R, rotation_from_quat(q[0], q[1], q[2], q[3]), s)
             inv_z = 1.0 / x[2]
             jx = -clamped(x[0] * inv_z, camera[2], fx, width) * fx * inv_z
             jy = -clamped(x[1] * inv_z, camera[3], fy, height) * fy * inv_z
@@ -172,10 +202,7 @@ def project_backward(
                 q = raw * inv_norm
                 Rq = rotation_from_quat(q[0], q[1], q[2], q[3])
                 s = ti.Vector([ti.exp(log_scale[i, k]) for k in range(3)])
-                M = R @ Rq
-                for k in ti.static(range(3)):
-                    for r in ti.static(range(3)):
-                        M[r, k] *= s[k]
+                M = axes_in_camera(R, Rq, s)
                 inv_z = 1.0 / x[2]
                 rx, ry = x[0] * inv_z, x[1] * inv_z
                 tx, ty = clamped(rx, camera[2], fx, width), clamped(ry, camera[3], fy, height)
@@ -212,17 +239,9 @@ def project_backward(
                 inv_z2 = inv_z * inv_z
                 gx, gy = gu * j0, gv * j1
                 gzc = gz - (gu * fx * rx + gv * fy * ry) * inv_z - (gj0 * fx + gj1 * fy) * inv_z2
-                if tx == rx:
-                    gx -= gjx * fx * inv_z2
-                    gzc += 2.0 * gjx * fx * tx * inv_z2
-                else:
-                    gzc += gjx * fx * tx * inv_z2
-                if ty == ry:
-                    gy -= gjy * fy * inv_z2
-                    gzc += 2.0 * gjy * fy * ty * inv_z2
-                else:
-                    gzc += gjy * fy * ty * inv_z2
-                gp = ti.Vector([gx, gy, gzc])
+                jx_by_x, jx_by_z = jacobian_gradient(gjx, fx, rx, tx, inv_z2)
+                jy_by_y, jy_by_z = jacobian_gradient(gjy, fy, ry, ty, inv_z2)
+                gp = ti.Vector([gx + jx_by_x, gy + jy_by_y, gzc + jx_by_z + jy_by_z])
                 gw = R.transpose() @ gp
                 for c in ti.static(range(3)):
                     grad_mean[i, c] += gw[c]
@@ -240,24 +259,7 @@ def project_backward(
                         H[r, k] *= s[k]
                     # A's column k times its own gradient, and mz's, with what cancels left out
                     grad_log_scale[i, k] += 2.0 * (gmz[k] * rest[k] - gbx[k] * bx[k] - gby[k] * by[k])
-                w, a, b, c = q[0], q[1], q[2], q[3]
-                gq = 2.0 * ti.Vector(
-                    [
-                        a * (H[2, 1] - H[1, 2]) + b * (H[0, 2] - H[2, 0]) + c * (H[1, 0] - H[0, 1]),
-                        w * (H[2, 1] - H[1, 2])
-                        + b * (H[0, 1] + H[1, 0])
-                        + c * (H[0, 2] + H[2, 0])
-                        - 2.0 * a * (H[1, 1] + H[2, 2]),
-                        w * (H[0, 2] - H[2, 0])
-                        + a * (H[0, 1] + H[1, 0])
-                        + c * (H[1, 2] + H[2, 1])
-                        - 2.0 * b * (H[0, 0] + H[2, 2]),
-                        w * (H[1, 0] - H[0, 1])
-                        + a * (H[0, 2] + H[2, 0])
-                        + b * (H[1, 2] + H[2, 1])
-                        - 2.0 * c * (H[0, 0] + H[1, 1]),
-                    ]
-                )
+                gq = quat_gradient(H, q)
                 gq = (gq - q * gq.dot(q)) * inv_norm
                 for k in ti.static(range(4)):
                     grad_quat[i, k] += gq[k]
