@@ -6,6 +6,11 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# No test fails for the machine being slow
+settings.register_profile("tgslam", deadline=None)
+settings.load_profile("tgslam")
 
 
 @pytest.fixture(scope="session")

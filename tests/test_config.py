@@ -187,7 +187,7 @@ def configs_of(cls: type) -> st.SearchStrategy[Any]:
     return st.builds(cls, **values)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(config=configs_of(Config))
 def test_a_dumped_config_loads_back_equal(config: Config, tmp_path_factory: pytest.TempPathFactory) -> None:
     path = tmp_path_factory.mktemp("round") / "config.yaml"

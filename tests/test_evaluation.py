@@ -105,7 +105,7 @@ def test_icl_files_match_by_image_number_in_evo(icl_clip: Path, tmp_path: Path) 
     assert ate(estimate, truth, TOLERANCE_S).rmse_m < 1e-9
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.lists(st.floats(-3, 3), min_size=6, max_size=6), st.integers(0, 1000))
 def test_ate_does_not_depend_on_the_estimates_world(xi: list[float], seed: int) -> None:
     truth = random_walk(15, seed)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -192,7 +192,6 @@ def test_normals_of_other_surfaces_and_missing_ones_turn_nothing() -> None:
 
 
 @given(st.integers(0, 10_000), COMPONENTS, st.floats(0, 1))
-@settings(deadline=None)
 def test_a_turn_stays_a_rotation_and_never_leads_away_from_the_normal(
     seed: int, components: list[float], gain: float
 ) -> None:
@@ -206,7 +205,6 @@ def test_a_turn_stays_a_rotation_and_never_leads_away_from_the_normal(
 
 
 @given(COMPONENTS)
-@settings(deadline=None)
 def test_what_is_turned_is_the_third_axis(components: list[float]) -> None:
     """Against a rotation matrix made by hand: from the z axis to the normal, about their cross product."""
     normal = np.array(components)

@@ -91,7 +91,7 @@ def test_keep_compacts_in_order(kept: list[int]) -> None:
     assert_rows(gaussian_map, [*kept, 6, 7])
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.lists(st.tuples(st.integers(0, 20), st.integers(0, 2**31 - 1)), max_size=8), st.integers(1, 8))
 def test_any_sequence_of_append_and_keep(steps: list[tuple[int, int]], capacity: int) -> None:
     gaussian_map, ids, following = GaussianMap(capacity), np.zeros(0, np.intp), 0

@@ -7,7 +7,7 @@ import math
 import cv2
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
@@ -41,7 +41,6 @@ def transform(xi: np.ndarray) -> np.ndarray:
 
 
 @given(twists())
-@settings(deadline=None)
 def test_exp_is_the_matrix_exponential(xi: np.ndarray) -> None:
     np.testing.assert_allclose(geometry.se3_exp(xi), transform(xi), atol=1e-10)
 

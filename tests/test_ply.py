@@ -67,7 +67,7 @@ def test_another_reader_finds_the_public_attributes(tmp_path: Path) -> None:
     assert not vertices["nx"].any()
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(count=st.integers(0, 40), seed=st.integers(0, 99))
 def test_round_trip(count: int, seed: int, tmp_path_factory: pytest.TempPathFactory) -> None:
     path = tmp_path_factory.mktemp("map") / "map.ply"

@@ -74,7 +74,7 @@ def patchy_frames(draw: st.DrawFn) -> tuple[NDArray, NDArray, NDArray]:
     return 0.5 + texture, depth_m, wanted
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(patchy_frames(), st.integers(1, 3), st.integers(1, 4))
 def test_every_pixel_with_depth_is_covered_once(frame: tuple, smallest: int, levels: int) -> None:
     colour, depth_m, _ = frame
@@ -86,7 +86,7 @@ def test_every_pixel_with_depth_is_covered_once(frame: tuple, smallest: int, lev
     assert all((depth_m[square] > 0).any() for square in squares(cells))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(patchy_frames())
 def test_the_smallest_cells_that_are_wanted_by_half_are_covered_and_no_others(frame: tuple) -> None:
     colour, depth_m, wanted = frame
