@@ -27,8 +27,8 @@ class IntensityMoments:
 def fit_exposure(moments: IntensityMoments, model: str, fallback: Exposure) -> Exposure:
     """The exposure by the model "none", "gain" or "gain_bias"; `fallback` where the pixels do not determine it.
 
-    A rendered model is blurred, and a least-squares fit takes lost contrast for gain < 1 and bias > 0; over a run the
-    map would fade. The ratio of the mean intensities ("gain") does not see blur. "gain_bias" is the least-squares fit.
+    A rendered model is blurred, and a least-squares fit takes lost contrast for gain < 1 and bias > 0.
+    The ratio of the mean intensities ("gain") does not see blur. "gain_bias" is the least-squares fit.
     """
     if model == "none":
         return Exposure()
