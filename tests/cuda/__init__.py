@@ -1,0 +1,1 @@
+"""CUDA kernels, generated and executed without a GPU; see `harness`."""
