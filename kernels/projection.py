@@ -1,21 +1,24 @@
 """Projection of 3D Gaussians to screen-space splats, and its gradient.
 
 A splat is what the rasterizer needs of a Gaussian: centre, inverse covariance, opacity, tangent-plane depth, colour.
-Columns of a splat row (and of its gradient) are the constants below.
+Columns of a splat row, and of the moments that the rasterizer's backward pass sums for it, are the constants below.
 """
 
 import taichi as ti
 
-from tgslam.kernels.simd import ALPHA_MIN, TILE
+from tgslam.kernels.simd import REACH, TILE
 
 nd = ti.types.ndarray
 mat3 = ti.types.matrix(3, 3, ti.f32)
 mat23 = ti.types.matrix(2, 3, ti.f32)
 
-U, V, QA, QB, QC, OPACITY, Z, ZU, ZV, RED, EMBEDDING = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 12
-SPLAT = 15  # columns of a splat row: u, v, qa, qb, qc, opacity, z, zu, zv, r, g, b, e0, e1, e2
-CURVATURE_COLOUR, CURVATURE_DEPTH = 15, 16
-SPLAT_GRAD = 17  # a gradient row has two more: the summed weights of the colour and the depth residuals
+U, V, QA, QB, QC, FADE, Z, ZU, ZV, RED, EMBEDDING, INV_Z = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 12, 15
+SPLAT = 16  # columns of a splat row: centre px, half the inverse covariance, -ln(opacity), depth and its slope, colours
+# Sums over pixels; h = alpha dL/dalpha, w = blend weight, (x, y) = offset from the centre, s = first-order depth step
+M_0, M_X, M_Y, M_XX, M_XY, M_YY = 0, 1, 2, 3, 4, 5  # h, h x, h y, h x^2, h x y, h y^2
+M_DEPTH, M_DEPTH_X, M_DEPTH_Y, M_SLOPE = 6, 7, 8, 9  # of w dL/ddepth: (1 - s^2/z^2), (1 + 2s/z) x, same y, same
+M_RED, M_CURVATURE_COLOUR, M_CURVATURE_DEPTH, M_EMBEDDING = 10, 13, 14, 16  # w times the pixel's gradient or weight
+MOMENTS = 20
 
 BLUR_DEPTH = 0.03  # px^2 in the regression of depth on the pixel: BLUR would flatten the depth slope of small splats
 BLUR = 0.3  # px^2 added to the screen covariance, the 3DGS standard's low-pass filter
@@ -119,6 +122,7 @@ def project(
     camera: nd(ti.f32, ndim=1),  # [4] fx, fy, cx, cy px
     width: ti.i32,
     height: ti.i32,
+    with_embedding: ti.template(),
     splat: nd(ti.f32, ndim=2),  # [N, SPLAT] out
     tile_rect: nd(ti.i32, ndim=2),  # [N, 4] out: first and last tile in x, then in y; empty: first > last
     tile_count: nd(ti.i32, ndim=1),  # [N] out: tiles touched
@@ -145,15 +149,16 @@ def project(
             qxx, qxy, qyy = cyy * inv_det, -cxy * inv_det, cxx * inv_det
             bx, by = precision_times_rows(ax, ay, BLUR_DEPTH)
             u, v = fx * x[0] * inv_z + camera[2], fy * x[1] * inv_z + camera[3]
-            opacity = sigmoid(opacity_logit[i])
+            fade = ti.log(1.0 + ti.exp(-ti.abs(opacity_logit[i]))) + ti.max(-opacity_logit[i], 0.0)
             splat[i, U], splat[i, V] = u, v
             splat[i, QA], splat[i, QB], splat[i, QC] = 0.5 * qxx, qxy, 0.5 * qyy
-            splat[i, OPACITY], splat[i, Z] = opacity, x[2]
+            splat[i, FADE], splat[i, Z], splat[i, INV_Z] = fade, x[2], inv_z
             splat[i, ZU], splat[i, ZV] = mz.dot(bx), mz.dot(by)
             for c in ti.static(range(3)):
                 splat[i, RED + c] = colour[i, c]
-                splat[i, EMBEDDING + c] = sigmoid(embedding[i, c])
-            reach = 2.0 * ti.log(ti.max(opacity / ALPHA_MIN, 1.0))  # Mahalanobis^2 where alpha has fallen to ALPHA_MIN
+                if ti.static(with_embedding):
+                    splat[i, EMBEDDING + c] = sigmoid(embedding[i, c])
+            reach = ti.max(2.0 * (REACH - fade), 0.0)  # Mahalanobis^2 where alpha has fallen to ALPHA_MIN
             rx, ry = ti.sqrt(reach * cxx), ti.sqrt(reach * cyy)
             if reach > 0.0 and u + rx >= 0 and u - rx <= width - 1 and v + ry >= 0 and v - ry <= height - 1:
                 x0 = ti.cast(ti.max(u - rx, 0.0), ti.i32) // TILE
@@ -177,8 +182,9 @@ def project_backward(
     camera: nd(ti.f32, ndim=1),  # [4] fx, fy, cx, cy px
     width: ti.i32,
     height: ti.i32,
+    with_embedding: ti.template(),
     tile_count: nd(ti.i32, ndim=1),  # [N] 0 = not rendered
-    splat_grad: nd(ti.f32, ndim=2),  # [N, SPLAT_GRAD]
+    moments: nd(ti.f32, ndim=2),  # [N, MOMENTS or more]
     grad_mean: nd(ti.f32, ndim=2),  # [N, 3] added to, as are all outputs but the pose's
     grad_log_scale: nd(ti.f32, ndim=2),  # [N, 3]
     grad_quat: nd(ti.f32, ndim=2),  # [N, 4]
@@ -188,7 +194,7 @@ def project_backward(
     curvature: nd(ti.f32, ndim=2),  # [N, 2] summed residual weights: colour, depth
     grad_pose: nd(ti.f32, ndim=2),  # [blocks, 6] (rotation, translation), left perturbation of T_cw, a row a block
 ):
-    """Gradients of splat rows -> gradients of the Gaussians' parameters and of the pose."""
+    """Moments of the splats -> gradients of the Gaussians' parameters and of the pose."""
     for block in range(grad_pose.shape[0]):
         pose_sum = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
         for i in range(block * POSE_BLOCK, ti.min((block + 1) * POSE_BLOCK, count)):
@@ -223,9 +229,10 @@ def project_backward(
                 pxx, pxy, pyy = ay.dot(ay) + BLUR_DEPTH, -cxy, ax.dot(ax) + BLUR_DEPTH
                 zu, zv = mz.dot(dx), mz.dot(dy)
                 rest = mz - zu * ax - zv * ay
-                gu, gv, gz = splat_grad[i, U], splat_grad[i, V], splat_grad[i, Z]
-                gzu, gzv = splat_grad[i, ZU], splat_grad[i, ZV]
-                gxx, gxy, gyy = 0.5 * splat_grad[i, QA], 0.5 * splat_grad[i, QB], 0.5 * splat_grad[i, QC]
+                gz, gzu, gzv = moments[i, M_DEPTH], moments[i, M_DEPTH_X], moments[i, M_DEPTH_Y]
+                gu = qxx * moments[i, M_X] + qxy * moments[i, M_Y] - zu * moments[i, M_SLOPE]
+                gv = qxy * moments[i, M_X] + qyy * moments[i, M_Y] - zv * moments[i, M_SLOPE]
+                gxx, gxy, gyy = -0.5 * moments[i, M_XX], -0.5 * moments[i, M_XY], -0.5 * moments[i, M_YY]
                 gbx, gby = gxx * bx + gxy * by, gxy * bx + gyy * by
                 gmz = gzu * dx + gzv * dy
                 gax = (pxx * gzu + pxy * gzv) * inv_depth_det * rest - zu * gmz - 2.0 * (qxx * gbx + qxy * gby)
@@ -263,13 +270,13 @@ def project_backward(
                 gq = (gq - q * gq.dot(q)) * inv_norm
                 for k in ti.static(range(4)):
                     grad_quat[i, k] += gq[k]
-                opacity = sigmoid(opacity_logit[i])
-                grad_opacity_logit[i] += splat_grad[i, OPACITY] * opacity * (1.0 - opacity)
+                grad_opacity_logit[i] += moments[i, M_0] * sigmoid(-opacity_logit[i])
                 for k in ti.static(range(3)):
-                    grad_colour[i, k] += splat_grad[i, RED + k]
-                    e = sigmoid(embedding[i, k])
-                    grad_embedding[i, k] += splat_grad[i, EMBEDDING + k] * e * (1.0 - e)
-                curvature[i, 0] += splat_grad[i, CURVATURE_COLOUR]
-                curvature[i, 1] += splat_grad[i, CURVATURE_DEPTH]
+                    grad_colour[i, k] += moments[i, M_RED + k]
+                    if ti.static(with_embedding):
+                        e = sigmoid(embedding[i, k])
+                        grad_embedding[i, k] += moments[i, M_EMBEDDING + k] * e * (1.0 - e)
+                curvature[i, 0] += moments[i, M_CURVATURE_COLOUR]
+                curvature[i, 1] += moments[i, M_CURVATURE_DEPTH]
         for c in ti.static(range(6)):
             grad_pose[block, c] = pose_sum[c]

@@ -1,4 +1,14 @@
-"""What the vector kernels share: 16 lanes are the 4x4 pixels of a chunk, 16 chunks make a 16x16 tile."""
+"""What the vector kernels share: 16 lanes are the 4x4 pixels of a chunk, 16 chunks make a 16x16 tile.
+
+In a `lanes_kernel`, arithmetic on `Lanes` stays whole down to LLVM, which maps it to whatever vector registers the CPU
+has; a plain `ti.kernel` takes vectors apart first, and LLVM's vectorizer does not find all of them again. What works
+whole is `+ - * /`, `+=`, `*=`, `ti.min`, `ti.max`, `ti.sqrt`, `ti.floor` and `ti.select` on a comparison of two Lanes.
+Casts (a Lanes times an integer is one), bit patterns, `abs`, `exp`, unary minus and `-=` abort in Taichi 1.7.4.
+"""
+
+import functools
+import math
+from collections.abc import Callable
 
 import taichi as ti
 
@@ -9,23 +19,107 @@ PER_ROW = TILE // CHUNK
 CHUNKS = PER_ROW * PER_ROW
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.99
-SPREAD = 15  # a loop over tiles counts in steps of this, since Taichi hands a thread 512 iterations at a time; no power
-# of two, or LLVM turns `tile * 16 + chunk` into an `or` and no longer sees that lanes are contiguous
+SPREAD = 16  # a loop over tiles counts in steps of this, since Taichi hands a thread 512 iterations at a time
 T_MIN = 1e-4  # a chunk whose every pixel lets less than this through is finished
 
+REACH = -math.log(ALPHA_MIN)  # exponent where alpha has fallen to ALPHA_MIN
+_EXP_RANGE = 5.6  # a little beyond REACH: what is cut there is below the threshold
+# exp(-x), 0 <= x <= 0.7, to 8e-8 relative: Lawson's iteratively reweighted least squares
+_EXP = (0.999999921, -0.99999254, 0.499882589, -0.165973979, 0.0397725646, -0.00584676082)
+_EXP_8TH = tuple(c / 8.0**k for k, c in enumerate(_EXP))
+
 Lanes = ti.types.vector(LANES, ti.f32)
-LaneBits = ti.types.vector(LANES, ti.i32)
+LANE_X = tuple(float(j % CHUNK) for j in range(LANES))  # px, of a lane's pixel in its chunk
+LANE_Y = tuple(float(j // CHUNK) for j in range(LANES))
+
+
+def lanes_kernel(function: Callable[..., None]) -> Callable[..., None]:
+    """A `ti.kernel` in which vectors stay whole; its Lanes arrays must start at a multiple of 64 bytes."""
+    kernel = ti.kernel(function)
+
+    @functools.wraps(function)
+    def launch(*arguments: object) -> None:
+        config = ti.cfg
+        scalarize, config.real_matrix_scalarize = config.real_matrix_scalarize, False
+        try:
+            kernel(*arguments)
+        finally:
+            config.real_matrix_scalarize = scalarize
+
+    return launch
 
 
 @ti.func
 def exp_neg(q):
-    """exp(-q) for q >= 0 without a call, since a libm call stops vectorization (so does `floor` where SSE2 is all).
+    """exp(-q) for 0 <= q <= REACH, less than ALPHA_MIN beyond; relative error 2.1e-6. For scalars and Lanes alike.
 
-    2^whole by bit pattern, whole = t cut towards zero, and 2^fraction by a degree-4 minimax polynomial on (-1, 0]:
-    relative error 2.6e-6.
+    exp(-q / 8) by a polynomial, then three squarings: no casts and no bit patterns, which vectors cannot have.
     """
-    t = ti.max(-q * 1.4426950408889634, -126.0)
-    whole = ti.cast(t, ti.i32)
-    f = t - ti.cast(whole, ti.f32)
-    poly = 0.999997407 + f * (0.693030201 + f * (0.239341073 + f * (0.0530740658 + f * 0.00676708381)))
-    return ti.bit_cast((whole + 127) << 23, ti.f32) * poly
+    x = ti.min(q, _EXP_RANGE)
+    root = _EXP_8TH[4] + x * _EXP_8TH[5]
+    for k in ti.static(range(3, -1, -1)):
+        root = _EXP_8TH[k] + x * root
+    root *= root
+    root *= root
+    return root * root
+
+
+@ti.func
+def swapped(v, distance: ti.template()):
+    """Lane j gets lane j ^ distance."""
+    out = Lanes(0.0)
+    for j in ti.static(range(LANES)):
+        out[j] = v[j ^ distance]
+    return out
+
+
+@ti.func
+def lane_sum(v):
+    """Sum of the lanes, by halves: always in the same order."""
+    for k in ti.static(range(4)):
+        v = v + swapped(v, 8 >> k)
+    return v[0]
+
+
+@ti.func
+def lane_max(v):
+    """Largest of the lanes."""
+    for k in ti.static(range(4)):
+        v = ti.max(v, swapped(v, 8 >> k))
+    return v[0]
+
+
+@ti.func
+def merged(a, b, distance: ti.template()):
+    """Lane j gets a[j] + a[j ^ distance] where j & distance is 0, the same of b elsewhere."""
+    kept, other = Lanes(0.0), Lanes(0.0)
+    for j in ti.static(range(LANES)):
+        if ti.static(j & distance):
+            kept[j], other[j] = b[j], b[j ^ distance]
+        else:
+            kept[j], other[j] = a[j], a[j ^ distance]
+    return kept + other
+
+
+@ti.func
+def sums_of_4(a, b, c, d):
+    """Lanes whose lane j is the sum of the lanes of the (j % 4)-th argument."""
+    v = merged(merged(a, b, 1), merged(c, d, 1), 2)
+    v = v + swapped(v, 4)
+    return v + swapped(v, 8)
+
+
+@ti.func
+def sums_of_16(v0, v1, v2, v3, v4, v5, v6, v7, v8, v9, v10, v11, v12, v13, v14, v15):
+    """Lanes whose lane j is the sum of the lanes of vj: a transposition with additions, 45 vector operations."""
+    low = merged(
+        merged(merged(v0, v1, 1), merged(v2, v3, 1), 2),
+        merged(merged(v4, v5, 1), merged(v6, v7, 1), 2),
+        4,
+    )
+    high = merged(
+        merged(merged(v8, v9, 1), merged(v10, v11, 1), 2),
+        merged(merged(v12, v13, 1), merged(v14, v15, 1), 2),
+        4,
+    )
+    return merged(low, high, 8)

@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from tgslam import runtime
 from tgslam.gaussian_map import GaussianMap, MapGradient
 from tgslam.kernels import projection, rasterize
-from tgslam.kernels.simd import CHUNK, CHUNKS, LANES, PER_ROW, TILE
+from tgslam.kernels.simd import CHUNKS, LANES, TILE
 from tgslam.types import Camera, Gaussians, Rendering
 
+_MOMENT_ROWS = 2  # vectors that hold a splat's moments
 MIN_OPACITY = 0.5  # below it a pixel of `Rendering.depth_m` has no depth
 
 
@@ -44,11 +45,11 @@ class _SlotBuffers:
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
         self.ids = runtime.empty((capacity,), np.int32)
-        self.slots_of = runtime.empty((capacity,), np.int32)
+        self.entry = runtime.empty((capacity,), np.int32)
         self.todo = runtime.empty((capacity,), np.int32)
         self.mask = runtime.empty((capacity,), np.int32)
         self.slot = runtime.empty((capacity, projection.SPLAT))
-        self.grad = runtime.empty((capacity, projection.SPLAT_GRAD))
+        self.grad = runtime.empty((capacity, _MOMENT_ROWS, LANES))
 
 
 class _SplatBuffers:
@@ -56,8 +57,8 @@ class _SplatBuffers:
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
-        self.splat = runtime.empty((capacity, projection.SPLAT))
-        self.grad = runtime.empty((capacity, projection.SPLAT_GRAD))
+        self.splat = runtime.zeros((capacity, projection.SPLAT))
+        self.moments = runtime.empty((capacity, _MOMENT_ROWS, LANES))
         self.tile_rect = runtime.empty((capacity, 4), np.int32)
         self.tile_count = runtime.zeros((capacity,), np.int32)
         self.first_of = runtime.zeros((capacity,), np.int32)
@@ -70,14 +71,10 @@ class Rasterizer:
         self.camera = camera
         self.tiles_x = -(-camera.width // TILE)
         self.tiles = self.tiles_x * -(-camera.height // TILE)
-        rows = self.tiles * CHUNKS
         H, W = camera.height, camera.width
         self._camera = runtime.to_device([camera.fx, camera.fy, camera.cx, camera.cy])
-        self._out = runtime.zeros((rows, rasterize.OUT, LANES), lanes=True)
-        self._g = runtime.zeros((rows, rasterize.G, LANES), lanes=True)
-        self._state = runtime.empty((rows, 2, LANES), lanes=True)
-        self._acc = runtime.empty((self.tiles, rasterize.ACC, LANES), lanes=True)
-        self._origin = runtime.to_device([[(c % PER_ROW) * CHUNK, (c // PER_ROW) * CHUNK] for c in range(CHUNKS)])
+        self._g = runtime.zeros((self.tiles * CHUNKS, rasterize.G, LANES), lanes=True)
+        self._state = runtime.empty((self.tiles * CHUNKS, 2, LANES), lanes=True)
         self._images = RenderImages(
             runtime.zeros((H, W, 3)), runtime.zeros((H, W)), runtime.zeros((H, W)), runtime.zeros((H, W, 3))
         )
@@ -86,6 +83,7 @@ class Rasterizer:
         self._slots = _SlotBuffers(1 << 15)
         self._splats = _SplatBuffers(1)
         self._start = runtime.zeros((self.tiles + 1,), np.int32)
+        self._per_tile = runtime.zeros((self.tiles, rasterize.SEGMENTS), np.int32)
         self._pose = runtime.zeros((12,))
         self._with_embedding = False
         self.slot_count = 0
@@ -100,15 +98,16 @@ class Rasterizer:
             raise ValueError(f"T_cw must be a finite [4, 4] matrix, got shape {T_cw.shape}")
         self._with_embedding = with_embedding
         self._pose = runtime.to_device(T_cw[:3].reshape(12))
-        self._list_slots(gaussians)
+        self._project(gaussians)
+        self._list_slots(gaussians.count)
         slots, images = self._slots, self._images
         rasterize.pack_slots(
             self.tiles, self.tiles_x, self._start, slots.ids, self._splats.splat, slots.slot, slots.mask
         )
-        rasterize.forward(self.tiles, self._start, slots.slot, slots.mask, slots.todo, with_embedding, self._out)
-        rasterize.unpack_image(
-            self._out, self.tiles_x, with_embedding, images.colour, images.depth, images.opacity, images.embedding
-        )
+        rasterize.forward(
+            self.tiles, self.tiles_x, self._start, slots.slot, slots.mask, slots.todo, with_embedding,
+            images.colour, images.depth, images.opacity, images.embedding,
+        )  # fmt: skip
         return images
 
     def backward(self, gaussians: GaussianMap, g: ImageGradient, into: MapGradient) -> NDArray[np.float64]:
@@ -120,22 +119,24 @@ class Rasterizer:
         embedding = g.embedding is not None
         if embedding and not self._with_embedding:
             raise ValueError("an embedding gradient needs a forward pass with_embedding=True")
-        slots, splats, n = self._slots, self._splats, gaussians.count
+        slots, splats, images, n = self._slots, self._splats, self._images, gaussians.count
         rasterize.pack_gradient(
-            self._out, self.tiles_x, self.camera.height, self.camera.width, embedding, curvature,
+            self.tiles, self.tiles_x, embedding, curvature,
+            images.colour, images.depth, images.opacity, images.embedding,
             g.colour, g.depth, g.opacity, g.embedding if embedding else self._no_embedding,
             g.colour_weight if curvature else self._no_weight, g.depth_weight if curvature else self._no_weight,
             self._g,
         )  # fmt: skip
         rasterize.backward(
-            self.tiles, self._start, slots.slot, slots.mask, self._origin, self._g, embedding, curvature,
-            self._state, self._acc, slots.grad,
+            self.tiles, self._start, slots.slot, slots.mask, slots.entry, self._g, embedding, curvature,
+            self._state, slots.grad,
         )  # fmt: skip
-        rasterize.gather_gradients(n, splats.tile_count, splats.first_of, slots.slots_of, slots.grad, splats.grad)
+        rasterize.gather_gradients(n, splats.tile_count, splats.first_of, embedding, slots.grad, splats.moments)
         blocks = runtime.zeros((max(1, -(-n // projection.POSE_BLOCK)), 6))
         projection.project_backward(
             n, gaussians.mean, gaussians.log_scale, gaussians.quat_wxyz, gaussians.opacity_logit, gaussians.embedding,
-            self._pose, self._camera, self.camera.width, self.camera.height, splats.tile_count, splats.grad,
+            self._pose, self._camera, self.camera.width, self.camera.height, embedding, splats.tile_count,
+            splats.moments.reshape(splats.capacity, -1),
             into.mean, into.log_scale, into.quat_wxyz, into.opacity_logit, into.colour, into.embedding, into.curvature,
             blocks,
         )  # fmt: skip
@@ -160,34 +161,35 @@ class Rasterizer:
         """[count] which Gaussians the last `forward` found inside the image."""
         return runtime.to_host(self._splats.tile_count)[:count] > 0
 
-    def _list_slots(self, gaussians: GaussianMap) -> None:
-        """Project, and list each tile's splats in depth order (equal depths by index)."""
-        n = gaussians.count
+    def _project(self, gaussians: GaussianMap) -> None:
+        """Splat rows, and the tiles that each Gaussian touches."""
         if self._splats.capacity < gaussians.capacity:
             self._splats = _SplatBuffers(gaussians.capacity)
         splats = self._splats
         projection.project(
-            n, gaussians.mean, gaussians.log_scale, gaussians.quat_wxyz, gaussians.opacity_logit, gaussians.colour,
-            gaussians.embedding, self._pose, self._camera, self.camera.width, self.camera.height,
-            splats.splat, splats.tile_rect, splats.tile_count,
+            gaussians.count, gaussians.mean, gaussians.log_scale, gaussians.quat_wxyz, gaussians.opacity_logit,
+            gaussians.colour, gaussians.embedding, self._pose, self._camera, self.camera.width, self.camera.height,
+            self._with_embedding, splats.splat, splats.tile_rect, splats.tile_count,
         )  # fmt: skip
-        tile_count = runtime.to_host(splats.tile_count)[:n]
-        ends = np.cumsum(tile_count)
-        self.slot_count = int(ends[-1]) if n else 0
+
+    def _list_slots(self, count: int) -> None:
+        """List each tile's splats in depth order (equal depths by index)."""
+        splats = self._splats
+        tile_count = runtime.to_host(splats.tile_count)[:count]
+        ends = np.cumsum(tile_count, dtype=np.int32)
+        self.slot_count = int(ends[-1]) if count else 0
         if self.slot_count > self._slots.capacity:
             self._slots = _SlotBuffers(max(2 * self._slots.capacity, self.slot_count))
-        first_of = np.zeros(splats.capacity, np.int32)
-        first_of[:n] = ends - tile_count
-        splats.first_of = runtime.to_device(first_of, np.int32)
-        per_tile = runtime.zeros((self.tiles,), np.int32)
-        rasterize.count_slots(n, splats.tile_rect, self.tiles_x, per_tile)
-        start = np.concatenate([[0], np.cumsum(runtime.to_host(per_tile))]).astype(np.int32)
-        self._start = runtime.to_device(start, np.int32)
+        np.subtract(ends, tile_count, out=splats.first_of[:count])
         visible = np.flatnonzero(tile_count)
         order = _depth_order(runtime.to_host(splats.splat)[visible, projection.Z], visible)
+        rasterize.count_slots(len(order), order, splats.tile_rect, self.tiles_x, self._per_tile)
+        ends = np.cumsum(self._per_tile, dtype=np.int32)
+        self._start[1:] = ends[rasterize.SEGMENTS - 1 :: rasterize.SEGMENTS]
+        cursor = (ends - self._per_tile.ravel()).reshape(self._per_tile.shape)
         rasterize.fill_slots(
-            runtime.to_device(order, np.int32), len(order), splats.tile_rect, self.tiles_x,
-            runtime.to_device(start[:-1].copy(), np.int32), splats.first_of, self._slots.slots_of, self._slots.ids,
+            len(order), order, splats.tile_rect, self.tiles_x, cursor, splats.first_of,
+            self._slots.ids, self._slots.entry,
         )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from enum import Enum
 
@@ -10,6 +11,8 @@ import taichi as ti
 from numpy.typing import ArrayLike
 
 from tgslam.errors import DeviceError
+
+_ALIGNMENT = 64  # bytes, of 16 lanes loaded as one vector
 
 
 class Device(Enum):
@@ -69,7 +72,7 @@ def empty(shape: tuple[int, ...], dtype: type = np.float32, *, lanes: bool = Fal
     lanes: the last axis is the 16-wide vector axis of a `Lanes` kernel argument.
     """
     if device() is Device.CPU:
-        return np.empty(shape, dtype)
+        return _aligned(shape, dtype)
     element = ti.f32 if dtype is np.float32 else ti.i32
     if lanes:
         return ti.ndarray(ti.types.vector(shape[-1], element), shape[:-1])
@@ -96,3 +99,11 @@ def to_device(array: ArrayLike, dtype: type = np.float32) -> np.ndarray:
 def to_host(array: np.ndarray) -> np.ndarray:
     """A device array as a NumPy array: the same memory on the CPU, a copy under CUDA."""
     return array if isinstance(array, np.ndarray) else array.to_numpy()
+
+
+def _aligned(shape: tuple[int, ...], dtype: type) -> np.ndarray:
+    """Uninitialised NumPy memory at a multiple of `_ALIGNMENT`, as compiled `Lanes` kernels expect it."""
+    items, size = math.prod(shape), np.dtype(dtype).itemsize
+    buffer: np.ndarray = np.empty(items + _ALIGNMENT // size, dtype)
+    skip = -buffer.ctypes.data % _ALIGNMENT // size
+    return buffer[skip : skip + items].reshape(shape)
