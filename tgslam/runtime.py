@@ -66,6 +66,12 @@ def device() -> Device:
     return _Runtime.device or start()
 
 
+def wait() -> None:
+    """Return when everything launched on the device has ended (kernels on the CPU end before they return)."""
+    if device() is Device.CUDA:
+        ti.sync()
+
+
 def empty(shape: tuple[int, ...], dtype: type = np.float32, *, lanes: bool = False) -> np.ndarray:
     """An uninitialised array on the device: NumPy memory on the CPU (kernels use it in place), `ti.ndarray` under CUDA.
 

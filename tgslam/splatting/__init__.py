@@ -1,0 +1,1 @@
+"""The rasterizer's stages on each device, behind one interface."""

@@ -1,0 +1,154 @@
+"""Splatting on the CPU: the stages round the 16-lane kernels, and their scratch memory."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tgslam import runtime
+from tgslam.gaussian_map import GaussianMap, MapGradient
+from tgslam.kernels import projection, rasterize
+from tgslam.kernels.simd import CHUNKS, LANES, TILE
+from tgslam.splatting.images import ImageGradient, RenderImages
+from tgslam.stopwatch import Stopwatch, stage
+from tgslam.types import Camera
+
+_MOMENT_ROWS = 2  # vectors that hold a splat's moments
+
+
+class _SlotBuffers:
+    """Scratch for one entry per (splat, tile), grown by doubling."""
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self.ids = runtime.empty((capacity,), np.int32)
+        self.entry = runtime.empty((capacity,), np.int32)
+        self.todo = runtime.empty((capacity,), np.int32)
+        self.mask = runtime.empty((capacity,), np.int32)
+        self.slot = runtime.empty((capacity, projection.SPLAT))
+        self.grad = runtime.empty((capacity, _MOMENT_ROWS, LANES))
+
+
+class _SplatBuffers:
+    """Scratch for one entry per Gaussian, grown with the map's capacity."""
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self.splat = runtime.zeros((capacity, projection.SPLAT))
+        self.moments = runtime.empty((capacity, _MOMENT_ROWS, LANES))
+        self.tile_rect = runtime.empty((capacity, 4), np.int32)
+        self.tile_count = runtime.zeros((capacity,), np.int32)
+        self.first_of = runtime.zeros((capacity,), np.int32)
+
+
+class CpuSplatting:
+    """Stages of `forward`: project, list, pack, blend; of `backward`: spread, blend_backward, gather, unproject."""
+
+    def __init__(self, camera: Camera, stopwatch: Stopwatch | None = None) -> None:
+        self.camera, self.stopwatch = camera, stopwatch
+        self.tiles_x = -(-camera.width // TILE)
+        self.tiles = self.tiles_x * -(-camera.height // TILE)
+        H, W = camera.height, camera.width
+        self._camera = runtime.to_device([camera.fx, camera.fy, camera.cx, camera.cy])
+        self._g = runtime.zeros((self.tiles * CHUNKS, rasterize.G, LANES), lanes=True)
+        self._state = runtime.empty((self.tiles * CHUNKS, 2, LANES), lanes=True)
+        self._no_weight = runtime.zeros((H, W))
+        self._no_embedding = runtime.zeros((H, W, 3))
+        self._slots = _SlotBuffers(1 << 15)
+        self._splats = _SplatBuffers(1)
+        self._start = runtime.zeros((self.tiles + 1,), np.int32)
+        self._per_tile = runtime.zeros((self.tiles, rasterize.SEGMENTS), np.int32)
+        self.slot_count = 0
+
+    @property
+    def tile_count(self) -> np.ndarray:
+        """[capacity] int32 device array: tiles that each Gaussian touched in the last `forward`."""
+        return self._splats.tile_count
+
+    def forward(self, gaussians: GaussianMap, pose: np.ndarray, with_embedding: bool, images: RenderImages) -> None:
+        """Render into `images`. pose: device array [12], rows of [R | t] of T_cw."""
+        with stage(self.stopwatch, "project"):
+            self._project(gaussians, pose, with_embedding)
+        with stage(self.stopwatch, "list"):
+            slots = self._list_slots(gaussians.count)
+        with stage(self.stopwatch, "pack"):
+            rasterize.pack_slots(
+                self.tiles, self.tiles_x, self._start, slots.ids, self._splats.splat, slots.slot, slots.mask
+            )
+        with stage(self.stopwatch, "blend"):
+            rasterize.forward(
+                self.tiles, self.tiles_x, self._start, slots.slot, slots.mask, slots.todo, with_embedding,
+                images.colour, images.depth, images.opacity, images.embedding,
+            )  # fmt: skip
+
+    def backward(
+        self, gaussians: GaussianMap, pose: np.ndarray, images: RenderImages, g: ImageGradient, into: MapGradient
+    ) -> NDArray[np.float64]:
+        """Add the gradients of the last `forward` to `into`; returns the pose's [6]."""
+        curvature = g.colour_weight is not None and g.depth_weight is not None
+        embedding = g.embedding is not None
+        slots, splats, n = self._slots, self._splats, gaussians.count
+        with stage(self.stopwatch, "spread"):
+            rasterize.pack_gradient(
+                self.tiles, self.tiles_x, embedding, curvature,
+                images.colour, images.depth, images.opacity, images.embedding,
+                g.colour, g.depth, g.opacity, g.embedding if embedding else self._no_embedding,
+                g.colour_weight if curvature else self._no_weight, g.depth_weight if curvature else self._no_weight,
+                self._g,
+            )  # fmt: skip
+        with stage(self.stopwatch, "blend_backward"):
+            rasterize.backward(
+                self.tiles, self._start, slots.slot, slots.mask, slots.entry, self._g, embedding, curvature,
+                self._state, slots.grad,
+            )  # fmt: skip
+        with stage(self.stopwatch, "gather"):
+            rasterize.gather_gradients(n, splats.tile_count, splats.first_of, embedding, slots.grad, splats.moments)
+        with stage(self.stopwatch, "unproject"):
+            blocks = runtime.zeros((max(1, -(-n // projection.POSE_BLOCK)), 6))
+            projection.project_backward(
+                n, gaussians.mean, gaussians.log_scale, gaussians.quat_wxyz, gaussians.opacity_logit,
+                gaussians.embedding, pose, self._camera, self.camera.width, self.camera.height, embedding,
+                splats.tile_count, splats.moments.reshape(splats.capacity, -1),
+                into.mean, into.log_scale, into.quat_wxyz, into.opacity_logit, into.colour, into.embedding,
+                into.curvature, blocks,
+            )  # fmt: skip
+            return runtime.to_host(blocks).sum(0, dtype=np.float64)
+
+    def _project(self, gaussians: GaussianMap, pose: np.ndarray, with_embedding: bool) -> None:
+        """Splat rows, and the tiles that each Gaussian touches."""
+        if self._splats.capacity < gaussians.capacity:
+            self._splats = _SplatBuffers(gaussians.capacity)
+        splats = self._splats
+        projection.project(
+            gaussians.count, gaussians.mean, gaussians.log_scale, gaussians.quat_wxyz, gaussians.opacity_logit,
+            gaussians.colour, gaussians.embedding, pose, self._camera, self.camera.width, self.camera.height,
+            with_embedding, splats.splat, splats.tile_rect, splats.tile_count,
+        )  # fmt: skip
+
+    def _list_slots(self, count: int) -> _SlotBuffers:
+        """List each tile's splats in depth order (equal depths by index)."""
+        splats = self._splats
+        tile_count = runtime.to_host(splats.tile_count)[:count]
+        ends = np.cumsum(tile_count, dtype=np.int32)
+        self.slot_count = int(ends[-1]) if count else 0
+        if self.slot_count > self._slots.capacity:
+            self._slots = _SlotBuffers(max(2 * self._slots.capacity, self.slot_count))
+        np.subtract(ends, tile_count, out=splats.first_of[:count])
+        visible = np.flatnonzero(tile_count)
+        order = _depth_order(runtime.to_host(splats.splat)[visible, projection.Z], visible)
+        rasterize.count_slots(len(order), order, splats.tile_rect, self.tiles_x, self._per_tile)
+        ends = np.cumsum(self._per_tile, dtype=np.int32)
+        self._start[1:] = ends[rasterize.SEGMENTS - 1 :: rasterize.SEGMENTS]
+        cursor = (ends - self._per_tile.ravel()).reshape(self._per_tile.shape)
+        rasterize.fill_slots(
+            len(order), order, splats.tile_rect, self.tiles_x, cursor, splats.first_of,
+            self._slots.ids, self._slots.entry,
+        )  # fmt: skip
+        return self._slots
+
+
+def _depth_order(depth_m: NDArray[np.float32], index: NDArray[np.intp]) -> NDArray[np.int32]:
+    """`index` sorted by (depth, index): positive floats order like their bits, so one integer sort does both."""
+    keys = (depth_m.view(np.uint32).astype(np.int64) << 32) | index
+    keys.sort()
+    return (keys & 0xFFFFFFFF).astype(np.int32)

@@ -1,0 +1,29 @@
+"""What a rasterizer gives and takes: images on the device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass
+class RenderImages:
+    """The forward result as device arrays, overwritten by the next `forward` of the same rasterizer."""
+
+    colour: np.ndarray  # [H, W, 3]
+    depth: np.ndarray  # [H, W] m, sum of blend weight times tangent-plane depth (not divided by opacity)
+    opacity: np.ndarray  # [H, W]
+    embedding: np.ndarray  # [H, W, 3] instance colour, Eq. 3; written only with `with_embedding`
+
+
+@dataclass
+class ImageGradient:
+    """dL/d(image) for `backward`, and the loss's second derivatives where `curvature` is wanted."""
+
+    colour: np.ndarray  # [H, W, 3]
+    depth: np.ndarray  # [H, W] with respect to RenderImages.depth
+    opacity: np.ndarray  # [H, W]
+    embedding: np.ndarray | None = None  # [H, W, 3]
+    colour_weight: np.ndarray | None = None  # [H, W]
+    depth_weight: np.ndarray | None = None  # [H, W]
