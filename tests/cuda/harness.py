@@ -26,6 +26,9 @@ compiles once; results are kept too. `devices.cpu(f, **arguments)` and `devices.
 side; a scenario for CUDA alone is compared with what the test computes. They raise ScenarioError, with what the process
 wrote, if the scenario raises, crashes (an LLVM abort, a segmentation fault) or hangs, or if the check reports anything
 (a `cudastub:` line). The next scenario gets a new process then, so one failure hides no other.
+
+All kernels that the scenarios launch are also assembled and held against `tools/cudacheck/budgets.yaml`
+(test_budgets.py); after a change: `python -m tests.cuda.harness --write-budgets`.
 """
 
 from __future__ import annotations
@@ -37,21 +40,25 @@ import pkgutil
 import selectors
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import pytest
 
 from tests.cuda import scenarios
+from tools.cudacheck.budgets import BUDGETS_FILE, with_headroom, write_budgets
 from tools.cudacheck.environment import Grid, environment, reports
+from tools.cudacheck.ptxas import Usage, usage
 
 Results = dict[str, np.ndarray]
 Scenario = Callable[..., Results]
 _S = TypeVar("_S", bound=Scenario)
 
-GRIDS = list(Grid)
+GRIDS = [pytest.param(grid, id=grid.value) for grid in Grid]
 TIMEOUT_S = 600.0  # far above what any takes: a hang ends, a busy machine does not matter
 _MARK = "_is_cuda_scenario"
 _OUTPUT = "output.txt"  # what a worker prints
@@ -108,9 +115,11 @@ class Devices:
         """What a scenario gives on the CPU device and as CUDA kernels."""
         return self.cpu(function, **arguments), self.cuda(function, grid, **arguments)
 
-    def ptx_folders(self, grid: Grid = Grid.DEFAULT) -> list[Path]:
-        """Folders with the PTX of all that ran in this mode so far."""
-        return sorted(self._folder.glob(f"{grid.value}-*"))
+    def usage(self) -> list[Usage]:
+        """What all kernels of all scenarios take of a GPU. Raises MissingToolError without ptxas."""
+        for function in all_scenarios():
+            self.cuda(function)
+        return usage(self._folder.glob(f"{Grid.DEFAULT.value}-*"))
 
     def close(self) -> None:
         """End all processes."""
@@ -202,3 +211,21 @@ class _Worker:
                     return f"the process ended with status {self._process.wait()}"
                 answer += chunk
         return answer.decode().strip()
+
+
+def main(arguments: list[str]) -> int:
+    """Write the budgets of all kernels that the scenarios launch."""
+    if arguments != ["--write-budgets"]:
+        print("usage: python -m tests.cuda.harness --write-budgets", file=sys.stderr)
+        return 2
+    with tempfile.TemporaryDirectory() as folder:
+        devices = Devices(Path(folder))
+        try:
+            write_budgets(BUDGETS_FILE, with_headroom(devices.usage()))
+        finally:
+            devices.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -247,11 +247,11 @@ def _statement(text: str, line: int) -> Statement:
     if match:
         guard = Guard(match["register"], match["negated"] == "!")
         text = text[match.end() :]
-    opcode, _, operands = text.partition(" ") if " " in text else text.partition("\t")
-    name, *modifiers = opcode.strip().split(".")
+    opcode, *operands = text.split(None, 1)
+    name, *modifiers = opcode.split(".")
     if name == "call":
         call = _CALL.fullmatch(re.sub(r"\s*,\s*prototype_\d+$", "", " ".join(text.split())))
         if call is None:
             raise UnsupportedPtxError(f"line {line}: call {text[:80]!r}")
         return Call(call["target"], call["result"], split_operands(call["arguments"] or ""), line, guard)
-    return Instruction(name, tuple(modifiers), split_operands(operands), line, guard)
+    return Instruction(name, tuple(modifiers), split_operands("".join(operands)), line, guard)

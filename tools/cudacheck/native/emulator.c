@@ -274,6 +274,8 @@ static void rt_shared(Thread *t, u64 address, int bytes, SharedAccess kind, int 
     int in_static = p >= arena && p + bytes <= arena + launch.module->shared_bytes;
     int in_dynamic = p >= end - launch.dynamic_bytes && p + bytes <= end;
     if (!in_static && !in_dynamic) {
+        if (!launch.module->shared_bytes && !launch.dynamic_bytes)  // what Taichi 1.7.4 does above 48 KiB
+            fail(t, line, "shared memory access by a kernel that was launched without any: does it ask for too much?");
         char message[200];
         snprintf(message, sizeof message, "shared memory access out of range: offset %ld of %u bytes",
                  (long)(p - (launch.dynamic_bytes ? t->shared_dynamic : t->shared_static)),

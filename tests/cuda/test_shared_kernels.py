@@ -1,0 +1,47 @@
+"""Kernels that both devices launch unchanged: as CUDA kernels they give what they give on the CPU."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.cuda.harness import GRIDS, Devices, assert_close
+from tests.cuda.scenarios import adam, alignment, images, projection, relaxation
+from tools.cudacheck.environment import Grid
+
+pytestmark = [pytest.mark.cuda_check, pytest.mark.parametrize("grid", GRIDS)]
+
+
+def test_relaxation(devices: Devices, grid: Grid) -> None:
+    cpu, cuda = devices.both(relaxation.colours, grid)
+    assert_close(cuda, cpu, atol=1e-6)
+
+
+def test_adam(devices: Devices, grid: Grid) -> None:
+    cpu, cuda = devices.both(adam.steps, grid)
+    assert_close(cuda, cpu, rtol=1e-5, atol=1e-6)
+
+
+def test_colour_images(devices: Devices, grid: Grid) -> None:
+    cpu, cuda = devices.both(images.colour, grid)
+    assert_close(cuda, cpu, atol=1e-6)
+
+
+def test_depth_images(devices: Devices, grid: Grid) -> None:
+    cpu, cuda = devices.both(images.geometry, grid)
+    assert_close(cuda, cpu, atol=2e-5)
+    assert 0.3 < (cpu["normals"] != 0).any(axis=2).mean() < 1.0
+
+
+@pytest.mark.parametrize("with_embedding", [True, False])
+def test_projection(devices: Devices, grid: Grid, with_embedding: bool) -> None:
+    cpu, cuda = devices.both(projection.forward_and_backward, grid, with_embedding=with_embedding)
+    assert 0.1 < (cpu["tile_count"] > 0).mean() < 0.9
+    for name, expected in cpu.items():
+        scale = np.abs(expected).max(axis=0, keepdims=True) if expected.ndim > 1 else np.abs(expected).max()
+        np.testing.assert_allclose(cuda[name] / (scale + 1e-30), expected / (scale + 1e-30), atol=2e-5, err_msg=name)
+
+
+def test_alignment(devices: Devices, grid: Grid) -> None:
+    cpu, cuda = devices.both(alignment.normal_equations, grid)
+    np.testing.assert_allclose(cuda["sums"], cpu["sums"], rtol=1e-5, atol=1e-5 * np.abs(cpu["sums"]).max())
