@@ -26,7 +26,7 @@ enum {
     STACK_BYTES = 128 * 1024,
     ARENA_BYTES = 256 * 1024,  // static shared memory from its start, dynamic up to its end
     WARP = 32,
-    MAX_REPORTS = 5,  // of each launch: one mistake tends to show in every thread
+    MAX_REPORTS = 5,  // of one kind in a launch: a mistake tends to show in every thread
     FLUSH_TO_ZERO = 0x8040,
     ILLEGAL_ADDRESS = 700,
 };
@@ -106,12 +106,15 @@ typedef struct {
     u32 lane, clamp, mask, result, predicate;
 } Fiber;
 
+typedef enum { RACE, UNINITIALISED, BARRIER, SHUFFLE, KINDS } ReportKind;
+
 static struct {
     const Kernel *kernel;
     const ModuleInfo *module;
     void **parameters;
     u32 blocks, threads, dynamic_bytes;
-    int reversed, cooperates, reports;
+    int reversed, cooperates;
+    int reports[KINDS];
 } launch;
 
 static Fiber fibers[MAX_THREADS];
@@ -122,7 +125,7 @@ static jmp_buf thread_exit;
 static sigjmp_buf failure;
 static char failure_message[1024];
 
-static int may_report(void) { return launch.reports++ < MAX_REPORTS; }
+static int may_report(ReportKind kind) { return launch.reports[kind]++ < MAX_REPORTS; }
 
 static void fail(Thread *t, int line, const char *message) {
     snprintf(failure_message, sizeof failure_message, "%s: block %u thread %u PTX line %d: %s", launch.kernel->name,
@@ -234,7 +237,7 @@ static void touch(Cell *cell, int thread, SharedAccess kind, int line, long offs
     const char *race = NULL;
     int other = NOBODY, writes = kind != SHARED_READ, is_atomic = kind == SHARED_ATOMIC || kind == SHARED_EXCHANGE;
     if ((kind == SHARED_READ || kind == SHARED_ATOMIC) && cell->block != block_serial) {
-        if (may_report())
+        if (may_report(UNINITIALISED))
             report("%s: uninitialised shared memory read at PTX line %d: thread %d, block %u, offset %ld",
                    launch.kernel->name, line, thread, current->thread.ctaid[0], offset);
         cell->block = block_serial;  // once is enough
@@ -248,7 +251,7 @@ static void touch(Cell *cell, int thread, SharedAccess kind, int line, long offs
         race = "write after read";
         other = cell->reader;
     }
-    if (race && may_report()) {
+    if (race && may_report(RACE)) {
         if (other >= 0)
             report("%s: shared memory race (%s) at PTX line %d: threads %d and %d, block %u, offset %ld",
                    launch.kernel->name, race, line, other, thread, current->thread.ctaid[0], offset);
@@ -310,7 +313,7 @@ static void shuffle(Fiber *warp, int lane, u32 present) {
     f->predicate = inside;
     if (!inside) source = lane;
     if (!(present >> source & 1)) {
-        if (may_report())
+        if (may_report(SHUFFLE))
             report("%s: shuffle at PTX line %d reads lane %d, which does not take part (block %u, thread %u)",
                    launch.kernel->name, f->line, source, f->thread.ctaid[0], f->thread.tid[0]);
         source = lane;
@@ -423,10 +426,10 @@ static int release_barrier(int threads) {
         votes += (int)f->value;
     }
     if (!waiting) return 0;
-    if (different && may_report())
+    if (different && may_report(BARRIER))
         report("%s: divergent barrier: threads of block %u meet at different ones", launch.kernel->name,
                first->thread.ctaid[0]);
-    if (waiting < threads && may_report())
+    if (waiting < threads && may_report(BARRIER))
         report("%s: divergent barrier at PTX line %d: %d of %d threads of block %u reach it, the rest have exited",
                launch.kernel->name, first->line, waiting, threads, first->thread.ctaid[0]);
     epoch++;
