@@ -29,6 +29,11 @@ class Splatting(Protocol):
         """[capacity] int32 device array: tiles that each Gaussian touched in the last `forward`."""
         ...
 
+    @property
+    def pair_count(self) -> int:
+        """(splat, pixel) pairs that the last `forward` blended."""
+        ...
+
     def forward(self, gaussians: GaussianMap, pose: np.ndarray, with_embedding: bool, images: RenderImages) -> None:
         """Render into `images`. pose: device array [12], rows of [R | t] of T_cw."""
         ...
@@ -99,3 +104,8 @@ class Rasterizer:
     def slot_count(self) -> int:
         """(Gaussian, tile) pairs of the last `forward`."""
         return self._splatting.slot_count
+
+    @property
+    def pair_count(self) -> int:
+        """(Gaussian, pixel) pairs that the last `forward` blended, and `backward` will: what culling has left."""
+        return self._splatting.pair_count

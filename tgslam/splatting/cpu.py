@@ -65,6 +65,12 @@ class CpuSplatting:
         """[capacity] int32 device array: tiles that each Gaussian touched in the last `forward`."""
         return self._splats.tile_count
 
+    @property
+    def pair_count(self) -> int:
+        """(splat, pixel) pairs that the last `forward` blended, in whole chunks: `backward` takes the same ones."""
+        mask = runtime.to_host(self._slots.mask)[: self.slot_count]
+        return LANES * int(np.bitwise_count(mask.view(np.uint32)).sum())
+
     def forward(self, gaussians: GaussianMap, pose: np.ndarray, with_embedding: bool, images: RenderImages) -> None:
         """Render into `images`. pose: device array [12], rows of [R | t] of T_cw."""
         with stage(self.stopwatch, "project"):

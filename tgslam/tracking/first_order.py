@@ -10,6 +10,7 @@ from tgslam.config.schema import LossConfig, TrackingConfig
 from tgslam.gaussian_map import GaussianMap, MapGradient
 from tgslam.geometry import se3_exp
 from tgslam.render import ImageGradient, Rasterizer
+from tgslam.stopwatch import Stopwatch, stage
 from tgslam.tracking.exposure import Exposure
 from tgslam.tracking.gauss_newton import GaussNewtonTracker
 from tgslam.tracking.pyramid import finest_level
@@ -23,6 +24,7 @@ class FirstOrderTracker:
 
     def __init__(self, camera: Camera, config: TrackingConfig, loss: LossConfig) -> None:
         self.config, self.loss = config, loss
+        self.stopwatch: Stopwatch | None = None
         self.first = finest_level(camera, config.finest_width_px)
         self.cameras = [camera.halved(self.first + level) for level in range(len(config.first_order_iterations))]
         self.rasterizers = [Rasterizer(level) for level in self.cameras]
@@ -39,10 +41,13 @@ class FirstOrderTracker:
             self._gradient = MapGradient.zeros(gaussians.capacity)
         if self.config.exposure == "none":
             exposure = Exposure()
-        observations = self._observations(frame)
-        for level in reversed(range(len(self.cameras))):
-            T_cw, exposure = self._descend(level, observations[level], gaussians, T_cw, exposure)
-        return self._judge.assess(frame, gaussians, T_cw, exposure)
+        with stage(self.stopwatch, "pyramid"):
+            observations = self._observations(frame)
+        with stage(self.stopwatch, "align"):
+            for level in reversed(range(len(self.cameras))):
+                T_cw, exposure = self._descend(level, observations[level], gaussians, T_cw, exposure)
+        with stage(self.stopwatch, "judge"):
+            return self._judge.assess(frame, gaussians, T_cw, exposure)
 
     def _observations(self, frame: Frame) -> list[losses.Observation]:
         colour, depth_m = runtime.to_device(frame.colour), runtime.to_device(frame.depth_m)

@@ -12,7 +12,8 @@ from tgslam.config.schema import LossConfig, TrackingConfig
 from tgslam.gaussian_map import GaussianMap
 from tgslam.geometry import adjoint, inverse, se3_exp
 from tgslam.kernels import alignment
-from tgslam.render import Rasterizer
+from tgslam.render import Rasterizer, RenderImages
+from tgslam.stopwatch import Stopwatch, stage
 from tgslam.tracking.exposure import Exposure, IntensityMoments, fit_exposure
 from tgslam.tracking.lost import LostDetector
 from tgslam.tracking.pyramid import LiveLevel, ModelLevel, finest_level, live_pyramid, model_pyramid
@@ -44,6 +45,7 @@ class GaussNewtonTracker:
 
     def __init__(self, camera: Camera, config: TrackingConfig, loss: LossConfig) -> None:
         self.config, self.loss = config, loss
+        self.stopwatch: Stopwatch | None = None
         self.first = finest_level(camera, config.finest_width_px)
         self.camera = camera
         self.detector = LostDetector(config)
@@ -53,10 +55,12 @@ class GaussNewtonTracker:
         self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure
     ) -> TrackingResult:
         """Pose of `frame` from the prediction T_cw [4, 4] and the last frame's exposure."""
-        live = live_pyramid(frame, self.camera, self.first, len(self.config.iterations), self.loss)
+        with stage(self.stopwatch, "pyramid"):
+            live = live_pyramid(frame, self.camera, self.first, len(self.config.iterations), self.loss)
         for _ in range(self.config.renders):
             model = self._model(gaussians, T_cw)
-            T_ml, exposure, last = self._align(live, model, exposure)
+            with stage(self.stopwatch, "align"):
+                T_ml, exposure, last = self._align(live, model, exposure)
             T_cw = inverse(T_ml) @ T_cw
         return self._result(T_cw, T_ml, exposure, last)
 
@@ -91,7 +95,12 @@ class GaussNewtonTracker:
         In a smaller image the rasterizer's low-pass filter widens the splats: near ones reach over edges, and the pose
         is drawn by millimetres.
         """
-        rendered = self.rasterizer.forward(gaussians, T_cw)
+        with stage(self.stopwatch, "render"):
+            rendered = self.rasterizer.forward(gaussians, T_cw)
+        with stage(self.stopwatch, "pyramid"):
+            return self._model_pyramid(rendered)
+
+    def _model_pyramid(self, rendered: RenderImages) -> list[ModelLevel]:
         opacity = runtime.to_host(rendered.opacity)
         covered = opacity > self.config.min_opacity
         safe = np.maximum(opacity, self.config.min_opacity)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tgslam.config.schema import LossConfig, TrackingConfig
 from tgslam.gaussian_map import GaussianMap
 from tgslam.render import Rasterizer
+from tgslam.stopwatch import Stopwatch
 from tgslam.tracking.exposure import Exposure
 from tgslam.tracking.first_order import FirstOrderTracker
 from tgslam.tracking.gauss_newton import GaussNewtonTracker
@@ -23,6 +24,7 @@ class Tracker(Protocol):
     """A solver for the pose of one frame."""
 
     rasterizer: Rasterizer  # holds which Gaussians the last model image saw
+    stopwatch: Stopwatch | None  # set it to have the stages timed, for benchmarks
 
     def track(
         self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure
