@@ -25,6 +25,7 @@ from tgslam.kernels.simd import (
     T_MIN,
     TILE,
     Lanes,
+    at_most,
     lane_max,
     lane_sum,
     lanes_kernel,
@@ -155,8 +156,8 @@ def forward(
                 while m < done:
                     k = todo[first + m]
                     dx, dy = px - slot[k, U], py - slot[k, V]
-                    alpha = ti.min(raw_alpha(dx, dy, slot[k, QA], slot[k, QB], slot[k, QC], slot[k, FADE]), ALPHA_MAX)
-                    w = T * ti.select(alpha > Lanes(ALPHA_MIN), alpha, Lanes(0.0))
+                    raw = raw_alpha(dx, dy, slot[k, QA], slot[k, QB], slot[k, QC], slot[k, FADE])
+                    w = T * ti.select(raw > Lanes(ALPHA_MIN), at_most(raw, ALPHA_MAX), Lanes(0.0))
                     r += w * slot[k, RED]
                     g += w * slot[k, RED + 1]
                     b += w * slot[k, RED + 2]
@@ -183,7 +184,27 @@ def forward(
                             embedding[y, x, 0], embedding[y, x, 1], embedding[y, x, 2] = e0[j], e1[j], e2[j]
 
 
-@ti.kernel
+@ti.func
+def chunk_of(image: ti.template(), x0, y0):
+    """The pixels of a chunk of an [H, W] image; the image's last column and row go on beyond it."""
+    lanes = Lanes(0.0)
+    for j in ti.static(range(LANES)):
+        y, x = ti.min(y0 + j // CHUNK, image.shape[0] - 1), ti.min(x0 + j % CHUNK, image.shape[1] - 1)
+        lanes[j] = image[y, x]
+    return lanes
+
+
+@ti.func
+def chunk_of_channel(image: ti.template(), x0, y0, channel: ti.template()):
+    """The same of one channel of an [H, W, 3] image."""
+    lanes = Lanes(0.0)
+    for j in ti.static(range(LANES)):
+        y, x = ti.min(y0 + j // CHUNK, image.shape[0] - 1), ti.min(x0 + j % CHUNK, image.shape[1] - 1)
+        lanes[j] = image[y, x, channel]
+    return lanes
+
+
+@lanes_kernel
 def pack_gradient(
     tiles: ti.i32,
     tiles_x: ti.i32,
@@ -199,32 +220,32 @@ def pack_gradient(
     g_embedding: nd(ti.f32, ndim=3),  # [H, W, 3]
     w_colour: nd(ti.f32, ndim=2),  # [H, W] second derivative of the loss in a colour channel
     w_depth: nd(ti.f32, ndim=2),  # [H, W] second derivative of the loss in depth, 1/m^2
-    g: nd(ti.f32, ndim=3),  # [tiles * CHUNKS, G, LANES] out
+    pixels: nd(Lanes, ndim=2),  # [CHUNKS, 2] x and y of a chunk's pixels in its tile
+    g: nd(Lanes, ndim=2),  # [tiles * CHUNKS, G] out
 ):
     """Image gradients -> chunk layout, with g . out per pixel; pixels beyond the image get zero."""
     for row in range(tiles * CHUNKS):
         tile, chunk = row // CHUNKS, row % CHUNKS
-        x0 = (tile % tiles_x) * TILE + (chunk % PER_ROW) * CHUNK
-        y0 = (tile // tiles_x) * TILE + (chunk // PER_ROW) * CHUNK
-        for j in range(LANES):
-            x, y = x0 + (j & 3), y0 + (j >> 2)
-            total = 0.0
-            if x < depth.shape[1] and y < depth.shape[0]:
-                for c in ti.static(range(3)):
-                    g[row, G_COLOUR + c, j] = g_colour[y, x, c]
-                    total += g_colour[y, x, c] * colour[y, x, c]
-                g[row, G_DEPTH, j], g[row, G_OPACITY, j] = g_depth[y, x], g_opacity[y, x]
-                total += g_depth[y, x] * depth[y, x] + g_opacity[y, x] * opacity[y, x]
-                if ti.static(with_embedding):
-                    for c in ti.static(range(3)):
-                        g[row, G_EMBEDDING + c, j] = g_embedding[y, x, c]
-                        total += g_embedding[y, x, c] * embedding[y, x, c]
-                if ti.static(with_curvature):
-                    g[row, W_COLOUR, j], g[row, W_DEPTH, j] = w_colour[y, x], w_depth[y, x]
-            else:
-                for c in ti.static(range(G)):
-                    g[row, c, j] = 0.0
-            g[row, G_TOTAL, j] = total
+        tile_x, tile_y = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        x0, y0 = tile_x + (chunk % PER_ROW) * CHUNK, tile_y + (chunk // PER_ROW) * CHUNK
+        columns, rows = ti.cast(depth.shape[1] - tile_x, ti.f32), ti.cast(depth.shape[0] - tile_y, ti.f32)
+        inside = ti.select(pixels[chunk, 0] < Lanes(columns), Lanes(1.0), Lanes(0.0))
+        inside *= ti.select(pixels[chunk, 1] < Lanes(rows), Lanes(1.0), Lanes(0.0))
+        gd, go = chunk_of(g_depth, x0, y0) * inside, chunk_of(g_opacity, x0, y0) * inside
+        g[row, G_DEPTH], g[row, G_OPACITY] = gd, go
+        total = gd * chunk_of(depth, x0, y0) + go * chunk_of(opacity, x0, y0)
+        for c in ti.static(range(3)):
+            gc = chunk_of_channel(g_colour, x0, y0, c) * inside
+            g[row, G_COLOUR + c] = gc
+            total += gc * chunk_of_channel(colour, x0, y0, c)
+            if ti.static(with_embedding):
+                ge = chunk_of_channel(g_embedding, x0, y0, c) * inside
+                g[row, G_EMBEDDING + c] = ge
+                total += ge * chunk_of_channel(embedding, x0, y0, c)
+        if ti.static(with_curvature):
+            g[row, W_COLOUR] = chunk_of(w_colour, x0, y0) * inside
+            g[row, W_DEPTH] = chunk_of(w_depth, x0, y0) * inside
+        g[row, G_TOTAL] = total
 
 
 @lanes_kernel
@@ -234,6 +255,7 @@ def backward(
     slot: nd(ti.f32, ndim=2),  # [slots, SPLAT]
     mask: nd(ti.i32, ndim=1),  # [slots] as the forward pass left it
     entry: nd(ti.i32, ndim=1),  # [slots] row of slot_grad that each slot writes
+    pixels: nd(Lanes, ndim=2),  # [CHUNKS, 2] x and y of a chunk's pixels in its tile: read, not computed, for latency
     g: nd(Lanes, ndim=2),  # [tiles * CHUNKS, G]
     with_embedding: ti.template(),
     with_curvature: ti.template(),
@@ -261,13 +283,11 @@ def backward(
                     bits ^= lowest
                     chunk = 31 - ti.math.clz(lowest)
                     row = tile * CHUNKS + chunk
-                    dx = Lanes(LANE_X) + (ti.cast((chunk & 3) << 2, ti.f32) - u)
-                    dy = Lanes(LANE_Y) + (ti.cast((chunk >> 2) << 2, ti.f32) - v)
+                    dx, dy = pixels[chunk, 0] - u, pixels[chunk, 1] - v
                     T, rest = state[row, 0], state[row, 1]
                     gd = g[row, G_DEPTH]
                     raw = raw_alpha(dx, dy, slot[k, QA], slot[k, QB], slot[k, QC], slot[k, FADE])
-                    alpha = ti.min(raw, ALPHA_MAX)
-                    alpha = ti.select(alpha > Lanes(ALPHA_MIN), alpha, Lanes(0.0))
+                    alpha = ti.select(raw > Lanes(ALPHA_MIN), at_most(raw, ALPHA_MAX), Lanes(0.0))
                     w = T * alpha
                     step = slot[k, ZU] * dx + slot[k, ZV] * dy
                     gc = g[row, 0] * slot[k, RED] + g[row, 1] * slot[k, RED + 1] + g[row, 2] * slot[k, RED + 2]

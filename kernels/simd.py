@@ -49,16 +49,29 @@ def lanes_kernel(function: Callable[..., None]) -> Callable[..., None]:
     return launch
 
 
+def _is_vector(x: object) -> bool:
+    return isinstance(x, ti.Matrix) or (hasattr(x, "is_tensor") and x.is_tensor())
+
+
+@ti.func
+def at_most(x, bound: ti.template()):
+    """The smaller of x and a constant in one instruction; `ti.min` takes three, which handle NaN."""
+    if ti.static(_is_vector(x)):
+        return ti.select(x < Lanes(bound), x, Lanes(bound))
+    else:
+        return ti.select(x < bound, x, bound)
+
+
 @ti.func
 def exp_neg(q):
     """exp(-q) for 0 <= q <= REACH, less than ALPHA_MIN beyond; relative error 2.1e-6. For scalars and Lanes alike.
 
     exp(-q / 8) by a polynomial, then three squarings: no casts and no bit patterns, which vectors cannot have.
     """
-    x = ti.min(q, _EXP_RANGE)
-    root = _EXP_8TH[4] + x * _EXP_8TH[5]
-    for k in ti.static(range(3, -1, -1)):
-        root = _EXP_8TH[k] + x * root
+    x = at_most(q, _EXP_RANGE)
+    xx = x * x
+    low, middle, high = _EXP_8TH[0] + _EXP_8TH[1] * x, _EXP_8TH[2] + _EXP_8TH[3] * x, _EXP_8TH[4] + _EXP_8TH[5] * x
+    root = low + xx * (middle + xx * high)
     root *= root
     root *= root
     return root * root
@@ -92,13 +105,8 @@ def lane_max(v):
 @ti.func
 def merged(a, b, distance: ti.template()):
     """Lane j gets a[j] + a[j ^ distance] where j & distance is 0, the same of b elsewhere."""
-    kept, other = Lanes(0.0), Lanes(0.0)
-    for j in ti.static(range(LANES)):
-        if ti.static(j & distance):
-            kept[j], other[j] = b[j], b[j ^ distance]
-        else:
-            kept[j], other[j] = a[j], a[j ^ distance]
-    return kept + other
+    upper = Lanes([float(j & distance) for j in range(LANES)]) > Lanes(0.0)
+    return ti.select(upper, b, a) + ti.select(upper, swapped(b, distance), swapped(a, distance))
 
 
 @ti.func

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from tgslam import runtime
 from tgslam.gaussian_map import GaussianMap, MapGradient
 from tgslam.kernels import projection, rasterize
-from tgslam.kernels.simd import CHUNKS, LANES, TILE
+from tgslam.kernels.simd import CHUNK, CHUNKS, LANES, PER_ROW, TILE
 from tgslam.splatting.images import ImageGradient, RenderImages
 from tgslam.stopwatch import Stopwatch, stage
 from tgslam.types import Camera
@@ -50,6 +50,7 @@ class CpuSplatting:
         self.tiles = self.tiles_x * -(-camera.height // TILE)
         H, W = camera.height, camera.width
         self._camera = runtime.to_device([camera.fx, camera.fy, camera.cx, camera.cy])
+        self._pixels = _pixels_of_chunks()
         self._g = runtime.zeros((self.tiles * CHUNKS, rasterize.G, LANES), lanes=True)
         self._state = runtime.empty((self.tiles * CHUNKS, 2, LANES), lanes=True)
         self._no_weight = runtime.zeros((H, W))
@@ -100,11 +101,11 @@ class CpuSplatting:
                 images.colour, images.depth, images.opacity, images.embedding,
                 g.colour, g.depth, g.opacity, g.embedding if embedding else self._no_embedding,
                 g.colour_weight if curvature else self._no_weight, g.depth_weight if curvature else self._no_weight,
-                self._g,
+                self._pixels, self._g,
             )  # fmt: skip
         with stage(self.stopwatch, "blend_backward"):
             rasterize.backward(
-                self.tiles, self._start, slots.slot, slots.mask, slots.entry, self._g, embedding, curvature,
+                self.tiles, self._start, slots.slot, slots.mask, slots.entry, self._pixels, self._g, embedding, curvature,
                 self._state, slots.grad,
             )  # fmt: skip
         with stage(self.stopwatch, "gather"):
@@ -158,3 +159,11 @@ def _depth_order(depth_m: NDArray[np.float32], index: NDArray[np.intp]) -> NDArr
     keys = (depth_m.view(np.uint32).astype(np.int64) << 32) | index
     keys.sort()
     return (keys & 0xFFFFFFFF).astype(np.int32)
+
+
+def _pixels_of_chunks() -> np.ndarray:
+    """[CHUNKS, 2, LANES] px: x and y of each chunk's pixels in its tile."""
+    y, x = np.mgrid[:TILE, :TILE].reshape(2, PER_ROW, CHUNK, PER_ROW, CHUNK).swapaxes(2, 3)
+    pixels = runtime.empty((CHUNKS, 2, LANES), lanes=True)
+    pixels[:] = np.stack([x.reshape(CHUNKS, LANES), y.reshape(CHUNKS, LANES)], 1)
+    return pixels
