@@ -36,8 +36,9 @@ from tgslam.kernels.simd import (
 nd = ti.types.ndarray
 
 # Rows of the pixel gradient per chunk
-G_COLOUR, G_DEPTH, G_OPACITY, G_TOTAL, W_COLOUR, W_DEPTH, G_EMBEDDING = 0, 3, 4, 5, 6, 7, 8
-G = 11
+G_COLOUR, G_DEPTH, G_OPACITY, W_COLOUR, W_DEPTH, G_EMBEDDING = 0, 3, 4, 7, 8, 9
+G_T, G_REST = 5, 6  # and what changes from splat to splat: transmittance, g . out of what lies behind
+G = 12
 SEGMENTS = 16  # parts of the depth order that are counted and scattered on their own
 _THREAD_STEP = 512  # iterations that Taichi hands a thread at a time
 
@@ -90,38 +91,35 @@ def fill_slots(
                         to += 1
 
 
-@lanes_kernel
-def pack_slots(
-    tiles: ti.i32,
-    tiles_x: ti.i32,
-    start: nd(ti.i32, ndim=1),  # [tiles + 1]
-    ids: nd(ti.i32, ndim=1),  # [slots]
-    splat: nd(Lanes, ndim=1),  # [N] rows
-    slot: nd(Lanes, ndim=1),  # [slots] out: rows, u and v relative to the tile
-    mask: nd(ti.i32, ndim=1),  # [slots] out: bit c = the splat reaches chunk c
+@ti.func
+def pack_tile(
+    tile,
+    tiles_x,
+    start: ti.template(),
+    ids: ti.template(),
+    splat: ti.template(),
+    rows: ti.template(),
+    mask: ti.template(),
 ):
-    """Copy splat rows into slot order and find the chunks each reaches; the lanes are the 16 chunks."""
-    for spread in range(tiles * SPREAD):
-        tile = spread // SPREAD
-        if spread - tile * SPREAD == 0:
-            x0, y0 = ti.cast((tile % tiles_x) * TILE, ti.f32), ti.cast((tile // tiles_x) * TILE, ti.f32)
-            chunk_x, chunk_y = float(CHUNK) * Lanes(LANE_X), float(CHUNK) * Lanes(LANE_Y)
-            powers = Lanes([float(1 << c) for c in range(CHUNKS)])
-            for k in range(start[tile], start[tile + 1]):
-                row = splat[ids[k]]
-                u, v = row[U] - x0, row[V] - y0
-                a, b, c = row[QA], row[QB], row[QC]
-                row[U], row[V] = u, v
-                slot[k] = row
-                reach = (REACH - row[FADE]) * 1.0001 + 1e-5
-                slope_y, slope_x = -0.5 * b / c, -0.5 * b / a
-                xa, ya = chunk_x - u, chunk_y - v
-                xb, yb = xa + (CHUNK - 1.0), ya + (CHUNK - 1.0)
-                # the chunk's lines nearest to the centre, and the least exponent on each
-                xn, yn = ti.min(ti.max(xa, 0.0), xb), ti.min(ti.max(ya, 0.0), yb)
-                y1, x1 = ti.min(ti.max(slope_y * xn, ya), yb), ti.min(ti.max(slope_x * yn, xa), xb)
-                q = ti.min((a * xn + b * y1) * xn + c * y1 * y1, (a * x1 + b * yn) * x1 + c * yn * yn)
-                mask[k] = ti.cast(lane_sum(ti.select(q <= Lanes(reach), powers, Lanes(0.0))), ti.i32)
+    """Copy a tile's splat rows into slot order and find the chunks each reaches; the lanes are the 16 chunks."""
+    x0, y0 = ti.cast((tile % tiles_x) * TILE, ti.f32), ti.cast((tile // tiles_x) * TILE, ti.f32)
+    chunk_x, chunk_y = float(CHUNK) * Lanes(LANE_X), float(CHUNK) * Lanes(LANE_Y)
+    powers = Lanes([float(1 << c) for c in range(CHUNKS)])
+    for k in range(start[tile], start[tile + 1]):
+        row = splat[ids[k]]
+        u, v = row[U] - x0, row[V] - y0
+        a, b, c = row[QA], row[QB], row[QC]
+        row[U], row[V] = u, v
+        rows[k] = row
+        reach = (REACH - row[FADE]) * 1.0001 + 1e-5
+        slope_y, slope_x = -0.5 * b / c, -0.5 * b / a
+        xa, ya = chunk_x - u, chunk_y - v
+        xb, yb = xa + (CHUNK - 1.0), ya + (CHUNK - 1.0)
+        # the chunk's lines nearest to the centre, and the least exponent on each
+        xn, yn = ti.min(ti.max(xa, 0.0), xb), ti.min(ti.max(ya, 0.0), yb)
+        y1, x1 = ti.min(ti.max(slope_y * xn, ya), yb), ti.min(ti.max(slope_x * yn, xa), xb)
+        q = ti.min((a * xn + b * y1) * xn + c * y1 * y1, (a * x1 + b * yn) * x1 + c * yn * yn)
+        mask[k] = ti.cast(lane_sum(ti.select(q <= Lanes(reach), powers, Lanes(0.0))), ti.i32)
 
 
 @lanes_kernel
@@ -129,9 +127,12 @@ def forward(
     tiles: ti.i32,
     tiles_x: ti.i32,
     start: nd(ti.i32, ndim=1),  # [tiles + 1]
-    slot: nd(ti.f32, ndim=2),  # [slots, SPLAT]
-    mask: nd(ti.i32, ndim=1),  # [slots]; bits of splats behind an opaque chunk are cleared
-    todo: nd(ti.i32, ndim=1),  # [slots] scratch: one list a tile, reused for each chunk
+    ids: nd(ti.i32, ndim=1),  # [slots]
+    splat: nd(Lanes, ndim=1),  # [N] rows
+    rows: nd(Lanes, ndim=1),  # [slots] out: the splats' rows, u and v relative to the tile
+    slot: nd(ti.f32, ndim=2),  # [slots, SPLAT] the same memory as rows
+    mask: nd(ti.i32, ndim=1),  # [slots] out: bit c = the splat reaches chunk c, and no opaque splats hide it there
+    todo: nd(ti.i32, ndim=2),  # [PER_ROW, slots] scratch: a tile's lists for a row of its chunks
     with_embedding: ti.template(),
     colour: nd(ti.f32, ndim=3),  # [H, W, 3] out
     depth: nd(ti.f32, ndim=2),  # [H, W] out, m, sum of weight times tangent-plane depth
@@ -142,46 +143,51 @@ def forward(
     for spread in range(tiles * SPREAD):
         tile = spread // SPREAD
         if spread - tile * SPREAD == 0:
+            pack_tile(tile, tiles_x, start, ids, splat, rows, mask)
             first = start[tile]
-            for chunk in range(CHUNKS):
-                n = 0
+            for chunk_row in range(PER_ROW):
+                n0, n1, n2, n3 = 0, 0, 0, 0
                 for k in range(first, start[tile + 1]):
-                    todo[first + n] = k
-                    n += (mask[k] >> chunk) & 1
-                px = Lanes(LANE_X) + ti.cast((chunk % PER_ROW) * CHUNK, ti.f32)
-                py = Lanes(LANE_Y) + ti.cast((chunk // PER_ROW) * CHUNK, ti.f32)
-                T, r, g, b, d = Lanes(1.0), Lanes(0.0), Lanes(0.0), Lanes(0.0), Lanes(0.0)
-                e0, e1, e2 = Lanes(0.0), Lanes(0.0), Lanes(0.0)
-                m, done = 0, n
-                while m < done:
-                    k = todo[first + m]
-                    dx, dy = px - slot[k, U], py - slot[k, V]
-                    raw = raw_alpha(dx, dy, slot[k, QA], slot[k, QB], slot[k, QC], slot[k, FADE])
-                    w = T * ti.select(raw > Lanes(ALPHA_MIN), at_most(raw, ALPHA_MAX), Lanes(0.0))
-                    r += w * slot[k, RED]
-                    g += w * slot[k, RED + 1]
-                    b += w * slot[k, RED + 2]
-                    d += w * tangent_depth(slot[k, ZU] * dx + slot[k, ZV] * dy, slot[k, Z], slot[k, INV_Z])
-                    if ti.static(with_embedding):
-                        e0 += w * slot[k, EMBEDDING]
-                        e1 += w * slot[k, EMBEDDING + 1]
-                        e2 += w * slot[k, EMBEDDING + 2]
-                    T = T - w
-                    m += 1
-                    if (m & 7) == 0:
-                        if lane_max(T) < T_MIN:
-                            done = m
-                for rest in range(done, n):
-                    mask[todo[first + rest]] &= ~(1 << chunk)
-                x0 = (tile % tiles_x) * TILE + (chunk % PER_ROW) * CHUNK
-                y0 = (tile // tiles_x) * TILE + (chunk // PER_ROW) * CHUNK
-                for j in ti.static(range(LANES)):
-                    x, y = x0 + j % CHUNK, y0 + j // CHUNK
-                    if x < depth.shape[1] and y < depth.shape[0]:
-                        colour[y, x, 0], colour[y, x, 1], colour[y, x, 2] = r[j], g[j], b[j]
-                        depth[y, x], opacity[y, x] = d[j], 1.0 - T[j]
+                    bits = mask[k] >> (chunk_row * PER_ROW)
+                    todo[0, first + n0], todo[1, first + n1], todo[2, first + n2], todo[3, first + n3] = k, k, k, k
+                    n0, n1, n2, n3 = n0 + (bits & 1), n1 + (bits >> 1 & 1), n2 + (bits >> 2 & 1), n3 + (bits >> 3 & 1)
+                for column in range(PER_ROW):
+                    n = ti.select(column < 2, ti.select(column == 0, n0, n1), ti.select(column == 2, n2, n3))
+                    chunk = chunk_row * PER_ROW + column
+                    px = Lanes(LANE_X) + ti.cast(column * CHUNK, ti.f32)
+                    py = Lanes(LANE_Y) + ti.cast(chunk_row * CHUNK, ti.f32)
+                    T, r, g, b, d = Lanes(1.0), Lanes(0.0), Lanes(0.0), Lanes(0.0), Lanes(0.0)
+                    e0, e1, e2 = Lanes(0.0), Lanes(0.0), Lanes(0.0)
+                    m, done = 0, n
+                    while m < done:
+                        k = todo[column, first + m]
+                        dx, dy = px - slot[k, U], py - slot[k, V]
+                        raw = raw_alpha(dx, dy, slot[k, QA], slot[k, QB], slot[k, QC], slot[k, FADE])
+                        w = T * ti.select(raw > Lanes(ALPHA_MIN), at_most(raw, ALPHA_MAX), Lanes(0.0))
+                        r += w * slot[k, RED]
+                        g += w * slot[k, RED + 1]
+                        b += w * slot[k, RED + 2]
+                        d += w * tangent_depth(slot[k, ZU] * dx + slot[k, ZV] * dy, slot[k, Z], slot[k, INV_Z])
                         if ti.static(with_embedding):
-                            embedding[y, x, 0], embedding[y, x, 1], embedding[y, x, 2] = e0[j], e1[j], e2[j]
+                            e0 += w * slot[k, EMBEDDING]
+                            e1 += w * slot[k, EMBEDDING + 1]
+                            e2 += w * slot[k, EMBEDDING + 2]
+                        T = T - w
+                        m += 1
+                        if (m & 7) == 0:
+                            if lane_max(T) < T_MIN:
+                                done = m
+                    for rest in range(done, n):
+                        mask[todo[column, first + rest]] &= ~(1 << chunk)
+                    x0 = (tile % tiles_x) * TILE + column * CHUNK
+                    y0 = (tile // tiles_x) * TILE + chunk_row * CHUNK
+                    for j in ti.static(range(LANES)):
+                        x, y = x0 + j % CHUNK, y0 + j // CHUNK
+                        if x < depth.shape[1] and y < depth.shape[0]:
+                            colour[y, x, 0], colour[y, x, 1], colour[y, x, 2] = r[j], g[j], b[j]
+                            depth[y, x], opacity[y, x] = d[j], 1.0 - T[j]
+                            if ti.static(with_embedding):
+                                embedding[y, x, 0], embedding[y, x, 1], embedding[y, x, 2] = e0[j], e1[j], e2[j]
 
 
 @ti.func
@@ -204,31 +210,31 @@ def chunk_of_channel(image: ti.template(), x0, y0, channel: ti.template()):
     return lanes
 
 
-@lanes_kernel
-def pack_gradient(
-    tiles: ti.i32,
-    tiles_x: ti.i32,
+@ti.func
+def spread_gradient(
+    tile,
+    tiles_x,
     with_embedding: ti.template(),
     with_curvature: ti.template(),
-    colour: nd(ti.f32, ndim=3),  # [H, W, 3] of the forward pass
-    depth: nd(ti.f32, ndim=2),  # [H, W]
-    opacity: nd(ti.f32, ndim=2),  # [H, W]
-    embedding: nd(ti.f32, ndim=3),  # [H, W, 3]
-    g_colour: nd(ti.f32, ndim=3),  # [H, W, 3] dL/dcolour
-    g_depth: nd(ti.f32, ndim=2),  # [H, W] dL/d(sum of weight times depth)
-    g_opacity: nd(ti.f32, ndim=2),  # [H, W]
-    g_embedding: nd(ti.f32, ndim=3),  # [H, W, 3]
-    w_colour: nd(ti.f32, ndim=2),  # [H, W] second derivative of the loss in a colour channel
-    w_depth: nd(ti.f32, ndim=2),  # [H, W] second derivative of the loss in depth, 1/m^2
-    pixels: nd(Lanes, ndim=2),  # [CHUNKS, 2] x and y of a chunk's pixels in its tile
-    g: nd(Lanes, ndim=2),  # [tiles * CHUNKS, G] out
+    colour: ti.template(),
+    depth: ti.template(),
+    opacity: ti.template(),
+    embedding: ti.template(),
+    g_colour: ti.template(),
+    g_depth: ti.template(),
+    g_opacity: ti.template(),
+    g_embedding: ti.template(),
+    w_colour: ti.template(),
+    w_depth: ti.template(),
+    pixels: ti.template(),
+    g: ti.template(),
 ):
-    """Image gradients -> chunk layout, with g . out per pixel; pixels beyond the image get zero."""
-    for row in range(tiles * CHUNKS):
-        tile, chunk = row // CHUNKS, row % CHUNKS
-        tile_x, tile_y = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+    """A tile's image gradients -> chunk layout, with g . out per pixel; pixels beyond the image get zero."""
+    tile_x, tile_y = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+    columns, rows = ti.cast(depth.shape[1] - tile_x, ti.f32), ti.cast(depth.shape[0] - tile_y, ti.f32)
+    for chunk in range(CHUNKS):
+        row = tile * CHUNKS + chunk
         x0, y0 = tile_x + (chunk % PER_ROW) * CHUNK, tile_y + (chunk // PER_ROW) * CHUNK
-        columns, rows = ti.cast(depth.shape[1] - tile_x, ti.f32), ti.cast(depth.shape[0] - tile_y, ti.f32)
         inside = ti.select(pixels[chunk, 0] < Lanes(columns), Lanes(1.0), Lanes(0.0))
         inside *= ti.select(pixels[chunk, 1] < Lanes(rows), Lanes(1.0), Lanes(0.0))
         gd, go = chunk_of(g_depth, x0, y0) * inside, chunk_of(g_opacity, x0, y0) * inside
@@ -245,22 +251,34 @@ def pack_gradient(
         if ti.static(with_curvature):
             g[row, W_COLOUR] = chunk_of(w_colour, x0, y0) * inside
             g[row, W_DEPTH] = chunk_of(w_depth, x0, y0) * inside
-        g[row, G_TOTAL] = total
+        g[row, G_REST] = total
+        g[row, G_T] = Lanes(1.0)
 
 
 @lanes_kernel
 def backward(
     tiles: ti.i32,
+    tiles_x: ti.i32,
     start: nd(ti.i32, ndim=1),  # [tiles + 1]
     slot: nd(ti.f32, ndim=2),  # [slots, SPLAT]
     mask: nd(ti.i32, ndim=1),  # [slots] as the forward pass left it
     entry: nd(ti.i32, ndim=1),  # [slots] row of slot_grad that each slot writes
-    pixels: nd(Lanes, ndim=2),  # [CHUNKS, 2] x and y of a chunk's pixels in its tile: read, not computed, for latency
-    g: nd(Lanes, ndim=2),  # [tiles * CHUNKS, G]
     with_embedding: ti.template(),
     with_curvature: ti.template(),
-    state: nd(Lanes, ndim=2),  # [tiles * CHUNKS, 2] scratch: transmittance, and g . out of what lies behind
-    slot_grad: nd(Lanes, ndim=2),  # [slots, 2] out: moments; the second vector only with an embedding
+    colour: nd(ti.f32, ndim=3),  # [H, W, 3] of the forward pass
+    depth: nd(ti.f32, ndim=2),  # [H, W]
+    opacity: nd(ti.f32, ndim=2),  # [H, W]
+    embedding: nd(ti.f32, ndim=3),  # [H, W, 3]
+    g_colour: nd(ti.f32, ndim=3),  # [H, W, 3] dL/dcolour
+    g_depth: nd(ti.f32, ndim=2),  # [H, W] dL/d(sum of weight times depth)
+    g_opacity: nd(ti.f32, ndim=2),  # [H, W]
+    g_embedding: nd(ti.f32, ndim=3),  # [H, W, 3]
+    w_colour: nd(ti.f32, ndim=2),  # [H, W] second derivative of the loss in a colour channel
+    w_depth: nd(ti.f32, ndim=2),  # [H, W] second derivative of the loss in depth, 1/m^2
+    pixels: nd(Lanes, ndim=2),  # [CHUNKS, 2] x and y of a chunk's pixels in its tile: read, not computed, for latency
+    g: nd(Lanes, ndim=2),  # [tiles * CHUNKS, G] scratch
+    slot_grad: nd(Lanes, ndim=1),  # [slots] out: moments
+    slot_embedding_grad: nd(Lanes, ndim=1),  # [slots] out: the embedding's, written only with one
 ):
     """Moments of every slot, splat by splat over its chunks; nothing of the forward pass is stored but the image.
 
@@ -269,8 +287,10 @@ def backward(
     for spread in range(tiles * SPREAD):
         tile = spread // SPREAD
         if spread - tile * SPREAD == 0:
-            for row in range(tile * CHUNKS, (tile + 1) * CHUNKS):
-                state[row, 0], state[row, 1] = Lanes(1.0), g[row, G_TOTAL]
+            spread_gradient(
+                tile, tiles_x, with_embedding, with_curvature, colour, depth, opacity, embedding,
+                g_colour, g_depth, g_opacity, g_embedding, w_colour, w_depth, pixels, g,
+            )  # fmt: skip
             for k in range(start[tile], start[tile + 1]):
                 u, v, z, inv_z = slot[k, U], slot[k, V], slot[k, Z], slot[k, INV_Z]
                 a0, a1, a2, az, azu, azv = Lanes(0.0), Lanes(0.0), Lanes(0.0), Lanes(0.0), Lanes(0.0), Lanes(0.0)
@@ -284,7 +304,7 @@ def backward(
                     chunk = 31 - ti.math.clz(lowest)
                     row = tile * CHUNKS + chunk
                     dx, dy = pixels[chunk, 0] - u, pixels[chunk, 1] - v
-                    T, rest = state[row, 0], state[row, 1]
+                    T, rest = g[row, G_T], g[row, G_REST]
                     gd = g[row, G_DEPTH]
                     raw = raw_alpha(dx, dy, slot[k, QA], slot[k, QB], slot[k, QC], slot[k, FADE])
                     alpha = ti.select(raw > Lanes(ALPHA_MIN), at_most(raw, ALPHA_MAX), Lanes(0.0))
@@ -301,7 +321,7 @@ def backward(
                     rest = rest - w * gc
                     h = T * gc - rest / (1.0 - alpha)
                     h *= ti.select(raw < Lanes(ALPHA_MAX), alpha, Lanes(0.0))
-                    state[row, 0], state[row, 1] = T - w, rest
+                    g[row, G_T], g[row, G_REST] = T - w, rest
                     a0 += w * g[row, 0]
                     a1 += w * g[row, 1]
                     a2 += w * g[row, 2]
@@ -323,11 +343,11 @@ def backward(
                     mxy += hx * dy
                     myy += hy * dy
                 to = entry[k]
-                slot_grad[to, 0] = sums_of_16(
+                slot_grad[to] = sums_of_16(
                     m, mx, my, mxx, mxy, myy, az, azu, azv, slope, a0, a1, a2, ac, ad, Lanes(0.0)
                 )
                 if ti.static(with_embedding):
-                    slot_grad[to, 1] = sums_of_4(ae0, ae1, ae2, Lanes(0.0))
+                    slot_embedding_grad[to] = sums_of_4(ae0, ae1, ae2, Lanes(0.0))
 
 
 @lanes_kernel
@@ -336,16 +356,17 @@ def gather_gradients(
     tile_count: nd(ti.i32, ndim=1),  # [N]
     first_of: nd(ti.i32, ndim=1),  # [N]
     with_embedding: ti.template(),
-    slot_grad: nd(Lanes, ndim=2),  # [slots, 2]
+    slot_grad: nd(Lanes, ndim=1),  # [slots]
+    slot_embedding_grad: nd(Lanes, ndim=1),  # [slots]
     splat_grad: nd(Lanes, ndim=2),  # [N, 2] out
 ):
     """Sum each Gaussian's slots in a fixed order: no atomics, so the sum repeats."""
     for i in range(count):
         total, embedding = Lanes(0.0), Lanes(0.0)
         for k in range(first_of[i], first_of[i] + tile_count[i]):
-            total += slot_grad[k, 0]
+            total += slot_grad[k]
             if ti.static(with_embedding):
-                embedding += slot_grad[k, 1]
+                embedding += slot_embedding_grad[k]
         splat_grad[i, 0] = total
         if ti.static(with_embedding):
             splat_grad[i, 1] = embedding

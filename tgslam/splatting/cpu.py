@@ -23,10 +23,11 @@ class _SlotBuffers:
         self.capacity = capacity
         self.ids = runtime.empty((capacity,), np.int32)
         self.entry = runtime.empty((capacity,), np.int32)
-        self.todo = runtime.empty((capacity,), np.int32)
+        self.todo = runtime.empty((PER_ROW, capacity), np.int32)
         self.mask = runtime.empty((capacity,), np.int32)
         self.slot = runtime.empty((capacity, projection.SPLAT))
-        self.grad = runtime.empty((capacity, _MOMENT_ROWS, LANES))
+        self.grad = runtime.empty((capacity, LANES), lanes=True)
+        self.embedding_grad = runtime.empty((capacity, LANES), lanes=True)
 
 
 class _SplatBuffers:
@@ -42,7 +43,7 @@ class _SplatBuffers:
 
 
 class CpuSplatting:
-    """Stages of `forward`: project, list, pack, blend; of `backward`: spread, blend_backward, gather, unproject."""
+    """Stages of `forward`: project, list, blend; of `backward`: blend_backward, gather, unproject."""
 
     def __init__(self, camera: Camera, stopwatch: Stopwatch | None = None) -> None:
         self.camera, self.stopwatch = camera, stopwatch
@@ -52,7 +53,6 @@ class CpuSplatting:
         self._camera = runtime.to_device([camera.fx, camera.fy, camera.cx, camera.cy])
         self._pixels = _pixels_of_chunks()
         self._g = runtime.zeros((self.tiles * CHUNKS, rasterize.G, LANES), lanes=True)
-        self._state = runtime.empty((self.tiles * CHUNKS, 2, LANES), lanes=True)
         self._no_weight = runtime.zeros((H, W))
         self._no_embedding = runtime.zeros((H, W, 3))
         self._slots = _SlotBuffers(1 << 15)
@@ -78,13 +78,10 @@ class CpuSplatting:
             self._project(gaussians, pose, with_embedding)
         with stage(self.stopwatch, "list"):
             slots = self._list_slots(gaussians.count)
-        with stage(self.stopwatch, "pack"):
-            rasterize.pack_slots(
-                self.tiles, self.tiles_x, self._start, slots.ids, self._splats.splat, slots.slot, slots.mask
-            )
         with stage(self.stopwatch, "blend"):
             rasterize.forward(
-                self.tiles, self.tiles_x, self._start, slots.slot, slots.mask, slots.todo, with_embedding,
+                self.tiles, self.tiles_x, self._start, slots.ids, self._splats.splat,
+                slots.slot, slots.slot, slots.mask, slots.todo, with_embedding,
                 images.colour, images.depth, images.opacity, images.embedding,
             )  # fmt: skip
 
@@ -95,21 +92,18 @@ class CpuSplatting:
         curvature = g.colour_weight is not None and g.depth_weight is not None
         embedding = g.embedding is not None
         slots, splats, n = self._slots, self._splats, gaussians.count
-        with stage(self.stopwatch, "spread"):
-            rasterize.pack_gradient(
-                self.tiles, self.tiles_x, embedding, curvature,
+        with stage(self.stopwatch, "blend_backward"):
+            rasterize.backward(
+                self.tiles, self.tiles_x, self._start, slots.slot, slots.mask, slots.entry, embedding, curvature,
                 images.colour, images.depth, images.opacity, images.embedding,
                 g.colour, g.depth, g.opacity, g.embedding if embedding else self._no_embedding,
                 g.colour_weight if curvature else self._no_weight, g.depth_weight if curvature else self._no_weight,
-                self._pixels, self._g,
-            )  # fmt: skip
-        with stage(self.stopwatch, "blend_backward"):
-            rasterize.backward(
-                self.tiles, self._start, slots.slot, slots.mask, slots.entry, self._pixels, self._g, embedding, curvature,
-                self._state, slots.grad,
+                self._pixels, self._g, slots.grad, slots.embedding_grad,
             )  # fmt: skip
         with stage(self.stopwatch, "gather"):
-            rasterize.gather_gradients(n, splats.tile_count, splats.first_of, embedding, slots.grad, splats.moments)
+            rasterize.gather_gradients(
+                n, splats.tile_count, splats.first_of, embedding, slots.grad, slots.embedding_grad, splats.moments
+            )
         with stage(self.stopwatch, "unproject"):
             blocks = runtime.zeros((max(1, -(-n // projection.POSE_BLOCK)), 6))
             projection.project_backward(
