@@ -61,7 +61,8 @@ def count_slots(
                 i = order[o]
                 for ty in range(tile_rect[i, 2], tile_rect[i, 3] + 1):
                     for tx in range(tile_rect[i, 0], tile_rect[i, 1] + 1):
-                        per_tile[ty * tiles_x + tx, segment] += 1
+                        tile = ty * tiles_x + tx
+                        per_tile[tile, segment] = per_tile[tile, segment] + 1  # `+=` would be atomic, and slow
 
 
 @ti.kernel
