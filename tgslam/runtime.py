@@ -105,6 +105,15 @@ def to_device(array: ArrayLike, dtype: type = np.float32) -> np.ndarray:
     return result
 
 
+def upload(array: ArrayLike, into: np.ndarray) -> None:
+    """Copy a host array into a device array of the same shape and of float32."""
+    host: np.ndarray = np.ascontiguousarray(array, np.float32)
+    if device() is Device.CPU:
+        into[...] = host
+    else:
+        into.from_numpy(host)  # type: ignore[attr-defined]
+
+
 def to_host(array: np.ndarray) -> np.ndarray:
     """A device array as a NumPy array: the same memory on the CPU, a copy under CUDA."""
     return array if isinstance(array, np.ndarray) else array.to_numpy()

@@ -2,9 +2,11 @@
 
 import taichi as ti
 
-from tgslam.kernels.cuda.block import BLOCK, prefix_in_block
+from tgslam.kernels.cuda.block import BLOCK, WARPS, prefix_in_block
+from tgslam.kernels.cuda.warp import WARP, warp_sum
 
 nd = ti.types.ndarray
+vec6 = ti.types.vector(6, ti.f32)
 
 
 @ti.kernel
@@ -65,3 +67,29 @@ def prefix_sums(
 def entry(values: nd(ti.i32, ndim=1), k: ti.i32) -> ti.i32:
     """values[k], read back by the host."""
     return values[k]
+
+
+@ti.kernel
+def sum_rows(rows: nd(ti.f32, ndim=2), total: nd(ti.f32, ndim=1)) -> vec6:  # [n, 6], [6] out
+    """Sum of all rows in a fixed order, read back by the host."""
+    ti.loop_config(block_dim=BLOCK)
+    for thread in range(BLOCK):
+        of_warp = ti.simt.block.SharedArray((WARPS, 6), ti.f32)
+        own = vec6(0.0)
+        row = thread
+        while row < rows.shape[0]:
+            for c in ti.static(range(6)):
+                own[c] += rows[row, c]
+            row += BLOCK
+        for c in ti.static(range(6)):
+            in_warp = warp_sum(own[c])
+            if thread % WARP == 0:
+                of_warp[thread // WARP, c] = in_warp
+        ti.simt.block.sync()
+        if thread < 6:
+            in_block = 0.0
+            for w in ti.static(range(WARPS)):
+                in_block += of_warp[w, thread]
+            total[thread] = in_block
+        ti.simt.block.sync()
+    return vec6([total[c] for c in range(6)])

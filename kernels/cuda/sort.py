@@ -1,8 +1,8 @@
 """Stable radix sort of 32-bit keys with a payload, 8 bits a pass, least significant first.
 
-A pass cuts the array into chunks, a block each. `count_digits` counts the digits of every chunk, `scan_digits` adds them
-up over the chunks, `scatter` moves each entry behind those with a lower digit, of an earlier chunk, or before it in
-its own chunk.
+A pass cuts the array into chunks, a block each. `count_digits` counts the digits of every chunk, `scan_digits` adds
+them up over the chunks, `scatter` moves each entry behind those with a lower digit, and behind those with its own digit
+that come from an earlier chunk or stand before it in its own.
 """
 
 import taichi as ti
