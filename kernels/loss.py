@@ -1,71 +1,102 @@
-"""Kernels of the adaptive RGB-depth objective, Eqs. 12 and 13: value and gradient. CPU form.
+"""Kernels of the adaptive RGB-depth objective, Eqs. 12 and 13: value and gradient. CPU form; see objective.py.
 
-Luminance work runs on 16 pixels of a row at once: a `Lanes` image is [H, ceil(W / 16)] vectors, zero weight beyond W.
-Each row is cut into SPLIT parallel segments (see kernels/image.py); sums leave as one partial a segment.
+An image of one channel is [H, B] vectors of 16 pixels of a row, B = ceil(W / 16); an RGB image is [H, 3 B] vectors of
+interleaved channels, so that memory is what [H, W] and [H, W, 3] are where W is a multiple of 16. Beyond W, the mask,
+texture and depth are 0.
 
-The passes over one image, in order:
-  mix             rendered luminance x, structure weights, pixel counts
-  blur_moments    vertical window over x, x^2, x y
-  ssim            horizontal window, SSIM value, its derivative by the three moments
-  blur_rows       horizontal window over the derivatives (the window is symmetric: its own adjoint)
-  sobel_flow      derivative of the gradient term by the two Sobel responses
-  luma_gradient   vertical window and Sobel adjoint: derivative by x
-  colour_gradient intensity term, chain rule to colour, gain and bias
-  depth_gradient  Eq. 13
+The passes over one image, each row by row; a row has one writer, and leaves its own partial sums:
+  mix             rendered luminance x, weights of the structure terms, pixel counts
+  structure       SSIM and gradient term with their derivatives, up to the last, vertical step of the adjoints
+  add_partials    sums over the rows
+  gradient        the vertical step, intensity and depth terms, chain rule to the rendered images, gain and bias
 """
-
-import math
 
 import taichi as ti
 
-from tgslam.kernels.image import F2, F3, SPLIT, segment
-from tgslam.kernels.simd import LANES, Lanes
+from tgslam.kernels.objective import (
+    BIAS,
+    DEPTHS,
+    GAIN,
+    GEO,
+    GRAD,
+    INNER,
+    L1,
+    LUMA,
+    PIXELS,
+    RADIUS,
+    SSIM,
+    TAPS,
+    charbonnier_root,
+    depth_slopes,
+    flow_slopes,
+    mixed,
+    share,
+    ssim_slopes,
+)
+from tgslam.kernels.simd import LANES, SPREAD, Lanes, lane_sum, lanes_kernel
 
-RADIUS = 5  # px: the usual 11x11 SSIM window, and the border that the gradient and SSIM terms leave out
-SIGMA = 1.5  # px
-C1, C2 = 0.01**2, 0.03**2  # the usual SSIM constants for intensities in [0, 1]
-LUMA = (0.299, 0.587, 0.114)
-_BELL = [math.exp(-0.5 * (k / SIGMA) ** 2) for k in range(-RADIUS, RADIUS + 1)]
-TAPS = tuple(tap / sum(_BELL) for tap in _BELL)
-
+F1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
+F2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
 L2 = ti.types.ndarray(dtype=Lanes, ndim=2)
 L3 = ti.types.ndarray(dtype=Lanes, ndim=3)
 
-
-@ti.kernel
-def pack_luminance(
-    colour: F3,  # [H, W, 3] RGB
-    grey: L2,  # [H, B] out, 0 beyond W
-):
-    """Luminance as lanes."""
-    width = colour.shape[1]
-    for s in range(grey.shape[0] * SPLIT):
-        i, begin, end = segment(s, grey.shape[1])
-        for b in range(begin, end):
-            y = Lanes(0.0)
-            for k in ti.static(range(LANES)):
-                j = ti.min(b * LANES + k, width - 1)
-                value = LUMA[0] * colour[i, j, 0] + LUMA[1] * colour[i, j, 1] + LUMA[2] * colour[i, j, 2]
-                y[k] = ti.select(b * LANES + k < width, value, 0.0)
-            grey[i, b] = y
+LANE = tuple(float(k) for k in range(LANES))
+LUMA_PARTS = tuple(tuple(LUMA[(LANES * part + k) % 3] for k in range(LANES)) for part in range(3))
+MOMENTS = 3  # fields under the SSIM window: x, x^2, x y
+SLOPES = MOMENTS + 2  # derivatives by them, and by the two Sobel responses
 
 
-@ti.kernel
-def pack_texture(
-    gate: F2,  # [H, W] T of Eq. 11
-    texture: L2,  # [H, B] out: 1 - T, 0 in the border of RADIUS px and beyond W
-):
-    """Weight of the gradient and SSIM terms."""
-    height, width = gate.shape[0], gate.shape[1]
-    for s in range(height * SPLIT):
-        i, begin, end = segment(s, texture.shape[1])
-        for b in range(begin, end):
-            g = Lanes(0.0)
-            for k in ti.static(range(LANES)):
-                j = b * LANES + k
-                inside = (j >= RADIUS) and (j < width - RADIUS) and (i >= RADIUS) and (i < height - RADIUS)
-                g[k] = ti.select(inside, 1.0 - gate[i, ti.min(j, width - 1)], 0.0)
-            texture[i, b] = g
+@ti.func
+def channel(a, b, c, which: ti.template()):
+    """One channel of 16 pixels that lie interleaved in three vectors."""
+    out = Lanes(0.0)
+    for k in ti.static(range(LANES)):
+        if ti.static(3 * k + which < LANES):
+            out[k] = a[3 * k + which]
+        elif ti.static(3 * k + which < 2 * LANES):
+            out[k] = b[3 * k + which - LANES]
+        else:
+            out[k] = c[3 * k + which - 2 * LANES]
+    return out
+
+
+@ti.func
+def channel_sum(a, b, c):
+    """Sum over the channels of 16 pixels that lie interleaved in three vectors."""
+    return channel(a, b, c, 0) + channel(a, b, c, 1) + channel(a, b, c, 2)
+
+
+@ti.func
+def for_channels(v, part: ti.template()):
+    """Values of 16 pixels, repeated for the three channels: the part-th of the three interleaved vectors."""
+    out = Lanes(0.0)
+    for k in ti.static(range(LANES)):
+        out[k] = v[(LANES * part + k) // 3]
+    return out
+
+
+@ti.func
+def luma_at(colour: ti.template(), i, b):
+    """Luminance of block b of row i."""
+    return channel_sum(
+        colour[i, 3 * b] * Lanes(LUMA_PARTS[0]),
+        colour[i, 3 * b + 1] * Lanes(LUMA_PARTS[1]),
+        colour[i, 3 * b + 2] * Lanes(LUMA_PARTS[2]),
+    )
+
+
+@ti.func
+def inside_columns(b, width):
+    """1 for pixels of block b that are not in the border of RADIUS px, 0 for the rest."""
+    column = Lanes(LANE) + ti.cast(b * LANES, ti.f32)
+    from_left = ti.select(column > Lanes(RADIUS - 0.5), Lanes(1.0), Lanes(0.0))
+    return from_left * ti.select(column < Lanes(ti.cast(width - RADIUS, ti.f32) - 0.5), Lanes(1.0), Lanes(0.0))
+
+
+@ti.func
+def is_inside_row(i, height):
+    """Whether row i is not in the border."""
+    return i >= RADIUS and i < height - RADIUS
 
 
 @ti.func
@@ -84,358 +115,295 @@ def shifted(left, centre, right, offset: ti.template()):
 
 @ti.func
 def blurred_row(field: ti.template(), i, b, f):
-    """Horizontal window over field[i, :, f] at block b; zero outside the image."""
-    last = field.shape[1] - 1
-    left = field[i, ti.max(b - 1, 0), f] * ti.select(b > 0, 1.0, 0.0)
-    right = field[i, ti.min(b + 1, last), f] * ti.select(b < last, 1.0, 0.0)
-    centre = field[i, b, f]
+    """Horizontal window at block b of field [H, 1 + B + 1, F], whose outer blocks are 0."""
+    left, centre, right = field[i, b, f], field[i, b + 1, f], field[i, b + 2, f]
     total = TAPS[RADIUS] * centre
     for k in ti.static(range(1, RADIUS + 1)):
         total += TAPS[RADIUS + k] * (shifted(left, centre, right, -k) + shifted(left, centre, right, k))
     return total
 
 
-@ti.kernel
-def blur_luma(
-    grey: L2,  # [H, B]
-    out: L3,  # [H, B, 2] windowed y and y^2 in the vertical direction; rows of the border are left alone
+@lanes_kernel
+def observe_luma(
+    width: ti.i32,
+    colour: L2,  # [H, 3 B]
+    gate: L2,  # [H, B] T of Eq. 11
+    luma: L2,  # [H, B] out
+    texture: L2,  # [H, B] out: 1 - T, the weight of the structure terms; 0 in the border and beyond W
 ):
-    """Vertical window over an observed luminance and its square."""
-    height = grey.shape[0]
-    for s in range(height * SPLIT):
-        i, begin, end = segment(s, grey.shape[1])
-        if i >= RADIUS and i < height - RADIUS:
-            for b in range(begin, end):
-                y = grey[i, b]
-                first, second = TAPS[RADIUS] * y, TAPS[RADIUS] * y * y
+    """Luminance and texture of an observation."""
+    height = luma.shape[0]
+    for spread in range(height * SPREAD):
+        i = spread // SPREAD
+        if spread - i * SPREAD == 0:
+            inside = ti.select(is_inside_row(i, height), 1.0, 0.0)
+            for b in range(luma.shape[1]):
+                luma[i, b] = luma_at(colour, i, b)
+                texture[i, b] = inside * inside_columns(b, width) * (1.0 - gate[i, b])
+
+
+@lanes_kernel
+def observe_statistics(
+    luma: L2,  # [H, B]
+    column: L3,  # [H, 1 + B + 1, MOMENTS] scratch, outer blocks 0
+    statistics: L3,  # [H, B, 2] out, inside the border: mean and variance of y in the window
+):
+    """The observed side of SSIM."""
+    height = luma.shape[0]
+    for spread in range(height * SPREAD):
+        i = spread // SPREAD
+        if spread - i * SPREAD == 0 and is_inside_row(i, height):
+            for b in range(luma.shape[1]):
+                y = luma[i, b]
+                first, square = TAPS[RADIUS] * y, TAPS[RADIUS] * y * y
                 for k in ti.static(range(1, RADIUS + 1)):
-                    up, down = grey[i - k, b], grey[i + k, b]
+                    up, down = luma[i - k, b], luma[i + k, b]
                     first += TAPS[RADIUS + k] * (up + down)
-                    second += TAPS[RADIUS + k] * (up * up + down * down)
-                out[i, b, 0] = first
-                out[i, b, 1] = second
+                    square += TAPS[RADIUS + k] * (up * up + down * down)
+                column[i, b + 1, 0] = first
+                column[i, b + 1, 1] = square
+            for b in range(luma.shape[1]):
+                mean = blurred_row(column, i, b, 0)
+                statistics[i, b, 0] = mean
+                statistics[i, b, 1] = blurred_row(column, i, b, 1) - mean * mean
 
 
-@ti.kernel
-def luma_statistics(
-    field: L3,  # [H, B, 2] from blur_luma
-    statistics: L3,  # [H, B, 2] out: mean and variance of y in the window; 0 in the border rows
-):
-    """Horizontal window: the observed side of SSIM, once a keyframe."""
-    height = field.shape[0]
-    for s in range(height * SPLIT):
-        i, begin, end = segment(s, field.shape[1])
-        for b in range(begin, end):
-            mean, variance = Lanes(0.0), Lanes(0.0)
-            if i >= RADIUS and i < height - RADIUS:
-                for f in range(2):
-                    statistics[i, b, f] = blurred_row(field, i, b, f)
-                mean = statistics[i, b, 0]
-                variance = statistics[i, b, 1] - mean * mean
-            statistics[i, b, 0] = mean
-            statistics[i, b, 1] = variance
-
-
-@ti.kernel
+@lanes_kernel
 def mix(
-    colour: F3,  # [H, W, 3] rendered
-    opacity: F2,  # [H, W]
-    depth_gt: F2,  # [H, W] m
-    mask: F2,  # [H, W] M_rgb in [0, 1]
-    grey: L2,  # [H, B] observed y
-    texture: L2,  # [H, B] 1 - T
+    width: ti.i32,
+    colour: L2,  # [H, 3 B] rendered
+    opacity: L2,  # [H, B]
+    depth_gt: L2,  # [H, B] m
+    mask: L2,  # [H, B] M_rgb in [0, 1]
+    luma: L2,  # [H, B] observed y
+    texture: L2,  # [H, B]
     gain: ti.f32,
     bias: ti.f32,
     min_opacity: ti.f32,  # rendered pixels below it have no colour to compare
     min_depth_opacity: ti.f32,  # nor depth
-    x: L2,  # [H, B] out: y + M (gain luma + bias - y)
+    x: L2,  # [H, B] out
     weight: L2,  # [H, B] out: M (1 - T), 0 in the border
-    counts: F2,  # [H SPLIT, 3] out: sums of M, of M inside the border, of M_d
+    partial: F2,  # [H, TOTALS] out: PIXELS, INNER, DEPTHS
 ):
-    """What the structure terms compare: outside the mask, the rendering is taken to agree with the observation."""
-    height, width = colour.shape[0], colour.shape[1]
-    for s in range(height * SPLIT):
-        i, begin, end = segment(s, grey.shape[1])
-        pixels, inner, measured = 0.0, 0.0, 0.0
-        row_inside = (i >= RADIUS) and (i < height - RADIUS)
-        for b in range(begin, end):
-            y = grey[i, b]
-            difference, valid = Lanes(0.0), Lanes(0.0)
-            for k in ti.static(range(LANES)):
-                j = ti.min(b * LANES + k, width - 1)
-                inside = b * LANES + k < width
-                luma = LUMA[0] * colour[i, j, 0] + LUMA[1] * colour[i, j, 1] + LUMA[2] * colour[i, j, 2]
-                m = ti.select(inside and (opacity[i, j] >= min_opacity), mask[i, j], 0.0)
-                column_inside = (j >= RADIUS) and (j < width - RADIUS)
-                has_depth = inside and (depth_gt[i, j] > 0.0) and (opacity[i, j] > min_depth_opacity)
-                pixels += m
-                inner += ti.select(row_inside and column_inside, m, 0.0)
-                measured += ti.select(has_depth, 1.0, 0.0)
-                valid[k] = m
-                difference[k] = gain * luma + bias
-            x[i, b] = y + valid * (difference - y)
-            weight[i, b] = valid * texture[i, b]
-        counts[s, 0] = pixels
-        counts[s, 1] = inner
-        counts[s, 2] = measured
+    """What the structure terms compare, and the pixel counts."""
+    height = luma.shape[0]
+    for spread in range(height * SPREAD):
+        i = spread // SPREAD
+        if spread - i * SPREAD == 0:
+            pixels, inner, depths = Lanes(0.0), Lanes(0.0), Lanes(0.0)
+            for b in range(luma.shape[1]):
+                rendered = opacity[i, b]
+                valid = ti.select(rendered >= Lanes(min_opacity), mask[i, b], Lanes(0.0))
+                x[i, b] = mixed(luma_at(colour, i, b), luma[i, b], valid, gain, bias)
+                weight[i, b] = valid * texture[i, b]
+                pixels += valid
+                inner += valid * inside_columns(b, width)
+                depths += measured(depth_gt[i, b], rendered, min_depth_opacity)
+            partial[i, PIXELS] = lane_sum(pixels)
+            partial[i, INNER] = ti.select(is_inside_row(i, height), lane_sum(inner), 0.0)
+            partial[i, DEPTHS] = lane_sum(depths)
 
 
-@ti.kernel
-def blur_moments(
+@ti.func
+def measured(depth_gt, opacity, min_depth_opacity):
+    """1 where rendered and measured depth can be compared, 0 elsewhere."""
+    has_depth = ti.select(depth_gt > Lanes(0.0), Lanes(1.0), Lanes(0.0))
+    return has_depth * ti.select(opacity > Lanes(min_depth_opacity), Lanes(1.0), Lanes(0.0))
+
+
+@lanes_kernel
+def structure(
     x: L2,  # [H, B]
     y: L2,  # [H, B]
-    out: L3,  # [H, B, 3] windowed x, x^2, x y in the vertical direction; rows of the border are left alone
-):
-    """Vertical window of the rendered side of SSIM."""
-    height = x.shape[0]
-    for s in range(height * SPLIT):
-        i, begin, end = segment(s, x.shape[1])
-        if i >= RADIUS and i < height - RADIUS:
-            for b in range(begin, end):
-                p = x[i, b]
-                first = TAPS[RADIUS] * p
-                square, product = first * p, first * y[i, b]
-                for k in ti.static(range(1, RADIUS + 1)):
-                    up, down = x[i - k, b], x[i + k, b]
-                    first += TAPS[RADIUS + k] * (up + down)
-                    square += TAPS[RADIUS + k] * (up * up + down * down)
-                    product += TAPS[RADIUS + k] * (up * y[i - k, b] + down * y[i + k, b])
-                out[i, b, 0] = first
-                out[i, b, 1] = square
-                out[i, b, 2] = product
-
-
-@ti.kernel
-def ssim(
-    field: L3,  # [H, B, 3] from blur_moments
     statistics: L3,  # [H, B, 2] mean and variance of y
     weight: L2,  # [H, B]
-    out: L3,  # [H, B, 3] out: weight times the derivative of 1 - SSIM by the windowed x, x^2, x y
-    sums: F2,  # [H SPLIT, 1] out: weighted sum of 1 - SSIM
-):
-    """SSIM of luminance in the 11x11 Gaussian window and its derivatives."""
-    height = field.shape[0]
-    for s in range(height * SPLIT):
-        i, begin, end = segment(s, field.shape[1])
-        total = 0.0
-        for b in range(begin, end):
-            by_mean, by_square, by_product = Lanes(0.0), Lanes(0.0), Lanes(0.0)
-            if i >= RADIUS and i < height - RADIUS:
-                for f in range(3):  # a loop over the moments compiles the window once
-                    out[i, b, f] = blurred_row(field, i, b, f)
-                mx, my = out[i, b, 0], statistics[i, b, 0]
-                variance = out[i, b, 1] - mx * mx
-                covariance = out[i, b, 2] - mx * my
-                a1, a2 = 2.0 * mx * my + C1, 2.0 * covariance + C2
-                b1, b2 = 1.0 / (mx * mx + my * my + C1), 1.0 / (variance + statistics[i, b, 1] + C2)
-                score, w = a1 * a2 * b1 * b2, weight[i, b]
-                by_square = w * score * b2
-                by_product = -2.0 * w * a1 * b1 * b2
-                by_mean = -2.0 * w * (my * b1 * b2 * (a2 - a1) + mx * score * (b2 - b1))
-                total += (w * (1.0 - score)).sum()
-            out[i, b, 0] = by_mean
-            out[i, b, 1] = by_square
-            out[i, b, 2] = by_product
-        sums[s, 0] = total
-
-
-@ti.kernel
-def blur_rows(
-    field: L3,  # [H, B, 3]
-    out: L3,  # [H, B, 3] out
-):
-    """Horizontal window over three fields; zero outside the image."""
-    for s in range(field.shape[0] * SPLIT):
-        i, begin, end = segment(s, field.shape[1])
-        for b in range(begin, end):
-            for f in range(3):
-                out[i, b, f] = blurred_row(field, i, b, f)
-
-
-@ti.kernel
-def sobel_flow(
-    x: L2,  # [H, B]
-    y: L2,  # [H, B]
-    weight: L2,  # [H, B]
     epsilon: ti.f32,  # Charbonnier, intensity per px
-    out: L3,  # [H, B, 2] out: weight times the derivative of the penalty by the Sobel responses in x and y
-    sums: F2,  # [H SPLIT, 1] out: weighted sum of the penalty
+    column: L3,  # [H, 1 + B + 1, MOMENTS] scratch, outer blocks 0
+    slope: L3,  # [H, 1 + B + 1, SLOPES] scratch, outer blocks 0
+    field: L3,  # [H, B, SLOPES] out, inside the border (0 there): derivatives, adjoint but for its vertical step
+    partial: F2,  # [H, TOTALS] out: SSIM, GRAD; 0 in the border
 ):
-    """Charbonnier penalty on the length of grad x - grad y (Sobel over 8, linear, so of the gradient of x - y)."""
-    height, last = x.shape[0], x.shape[1] - 1
-    for s in range(height * SPLIT):
-        i, begin, end = segment(s, x.shape[1])
-        up, down = ti.max(i - 1, 0), ti.min(i + 1, height - 1)
-        total = 0.0
-        for b in range(begin, end):
-            before, after = ti.max(b - 1, 0), ti.min(b + 1, last)
-            smooth_l = sobel_smooth(x, y, up, i, down, before)
-            smooth_c = sobel_smooth(x, y, up, i, down, b)
-            smooth_r = sobel_smooth(x, y, up, i, down, after)
-            step_l = sobel_step(x, y, up, down, before)
-            step_c = sobel_step(x, y, up, down, b)
-            step_r = sobel_step(x, y, up, down, after)
-            gx = shifted(smooth_l, smooth_c, smooth_r, 1) - shifted(smooth_l, smooth_c, smooth_r, -1)
-            gy = shifted(step_l, step_c, step_r, 1) + 2.0 * step_c + shifted(step_l, step_c, step_r, -1)
-            root = ti.sqrt(gx * gx + gy * gy + epsilon * epsilon)
-            w = weight[i, b]
-            total += (w * (root - epsilon)).sum()
-            out[i, b, 0] = w * gx / root
-            out[i, b, 1] = w * gy / root
-        sums[s, 0] = total
+    """SSIM in the 11x11 Gaussian window, and Charbonnier on the length of the Sobel gradient (over 8) of x - y."""
+    height, blocks = x.shape[0], x.shape[1]
+    for spread in range(height * SPREAD):
+        i = spread // SPREAD
+        if spread - i * SPREAD == 0 and is_inside_row(i, height):
+            for b in range(blocks):
+                blur_moments(x, y, i, b, column)
+            ssim, grad = Lanes(0.0), Lanes(0.0)
+            for b in range(blocks):
+                mx, xx, xy = blurred_row(column, i, b, 0), blurred_row(column, i, b, 1), blurred_row(column, i, b, 2)
+                penalty, by_mean, by_square, by_product = ssim_slopes(
+                    mx, xx, xy, statistics[i, b, 0], statistics[i, b, 1], weight[i, b]
+                )
+                ssim += penalty
+                slope[i, b + 1, 0] = by_mean
+                slope[i, b + 1, 1] = by_square
+                slope[i, b + 1, 2] = by_product
+                gx, gy = sobel_of_difference(x, y, i, b)
+                length, by_gx, by_gy = flow_slopes(gx, gy, weight[i, b], epsilon)
+                grad += length
+                slope[i, b + 1, 3] = by_gx
+                slope[i, b + 1, 4] = by_gy
+            for b in range(blocks):
+                for f in range(MOMENTS):
+                    field[i, b, f] = blurred_row(slope, i, b, f)  # the window is symmetric: its own adjoint
+                left, centre, right = slope[i, b, 3], slope[i, b + 1, 3], slope[i, b + 2, 3]
+                field[i, b, 3] = shifted(left, centre, right, -1) - shifted(left, centre, right, 1)
+                left, centre, right = slope[i, b, 4], slope[i, b + 1, 4], slope[i, b + 2, 4]
+                field[i, b, 4] = shifted(left, centre, right, -1) + 2.0 * centre + shifted(left, centre, right, 1)
+            partial[i, SSIM] = lane_sum(ssim)
+            partial[i, GRAD] = lane_sum(grad)
 
 
 @ti.func
-def sobel_smooth(x: ti.template(), y: ti.template(), up, row, down, b):
-    """Vertical smoothing half of Sobel over x - y, divided by 8."""
-    return 0.125 * (x[up, b] - y[up, b] + x[down, b] - y[down, b] + 2.0 * (x[row, b] - y[row, b]))
+def blur_moments(x: ti.template(), y: ti.template(), i, b, column: ti.template()):
+    """Vertical window over x, x^2, x y."""
+    p = x[i, b]
+    first = TAPS[RADIUS] * p
+    square, product = first * p, first * y[i, b]
+    for k in ti.static(range(1, RADIUS + 1)):
+        up, down = x[i - k, b], x[i + k, b]
+        first += TAPS[RADIUS + k] * (up + down)
+        square += TAPS[RADIUS + k] * (up * up + down * down)
+        product += TAPS[RADIUS + k] * (up * y[i - k, b] + down * y[i + k, b])
+    column[i, b + 1, 0] = first
+    column[i, b + 1, 1] = square
+    column[i, b + 1, 2] = product
 
 
 @ti.func
-def sobel_step(x: ti.template(), y: ti.template(), up, down, b):
-    """Vertical difference half of Sobel over x - y, divided by 8."""
-    return 0.125 * (x[down, b] - y[down, b] - x[up, b] + y[up, b])
+def sobel_of_difference(x: ti.template(), y: ti.template(), i, b):
+    """Sobel responses of x - y over 8, inside the border."""
+    before, after = ti.max(b - 1, 0), ti.min(b + 1, x.shape[1] - 1)  # beyond the image there is no weight
+    smooth_l, step_l = sobel_columns(x, y, i, before)
+    smooth_c, step_c = sobel_columns(x, y, i, b)
+    smooth_r, step_r = sobel_columns(x, y, i, after)
+    gx = shifted(smooth_l, smooth_c, smooth_r, 1) - shifted(smooth_l, smooth_c, smooth_r, -1)
+    gy = shifted(step_l, step_c, step_r, 1) + 2.0 * step_c + shifted(step_l, step_c, step_r, -1)
+    return gx, gy
 
 
 @ti.func
-def flow_smooth(flow: ti.template(), up, row, down, b):
-    """Vertical smoothing of the first component, divided by 8."""
-    return 0.125 * (flow[up, b, 0] + 2.0 * flow[row, b, 0] + flow[down, b, 0])
-
-
-@ti.func
-def flow_step(flow: ti.template(), up, down, b):
-    """Vertical difference of the second component, divided by 8 (adjoint: above minus below)."""
-    return 0.125 * (flow[up, b, 1] - flow[down, b, 1])
+def sobel_columns(x: ti.template(), y: ti.template(), i, b):
+    """Vertical half of Sobel over x - y: smoothed, and the difference, both over 8."""
+    up, row, down = x[i - 1, b] - y[i - 1, b], x[i, b] - y[i, b], x[i + 1, b] - y[i + 1, b]
+    return 0.125 * (up + down + 2.0 * row), 0.125 * (down - up)
 
 
 @ti.kernel
-def luma_gradient(
-    x: L2,  # [H, B]
+def add_partials(
+    partial: F2,  # [R, TOTALS]
+    first: ti.i32,
+    end: ti.i32,
+    totals: F1,  # [TOTALS] out: sums of the columns first <= c < end, rounded once
+):
+    """Sums over the rows, in their order."""
+    for c in range(first, end):
+        total = ti.cast(0.0, ti.f64)
+        for row in range(partial.shape[0]):
+            total += ti.cast(partial[row, c], ti.f64)
+        totals[c] = ti.cast(total, ti.f32)
+
+
+@lanes_kernel
+def gradient(
+    colour: L2,  # [H, 3 B] rendered
+    depth: L2,  # [H, B] m, accumulated: sum of weight times depth
+    opacity: L2,  # [H, B]
+    colour_gt: L2,  # [H, 3 B]
+    depth_gt: L2,  # [H, B] m, 0 = none
+    mask: L2,  # [H, B]
+    gate: L2,  # [H, B] T
+    x: L2,  # [H, B] from mix
     y: L2,  # [H, B]
-    field: L3,  # [H, B, 3] from blur_rows
-    flow: L3,  # [H, B, 2] from sobel_flow; 0 in the border, so the adjoint needs no care there
-    scale_ssim: ti.f32,
-    scale_grad: ti.f32,
-    out: L2,  # [H, B] out: derivative of both structure terms by x
-):
-    """Adjoint of the vertical window and of Sobel."""
-    height, last = x.shape[0], x.shape[1] - 1
-    for s in range(height * SPLIT):
-        i, begin, end = segment(s, x.shape[1])
-        up, down = ti.max(i - 1, 0), ti.min(i + 1, height - 1)
-        for b in range(begin, end):
-            by_mean = TAPS[RADIUS] * field[i, b, 0]
-            by_square = TAPS[RADIUS] * field[i, b, 1]
-            by_product = TAPS[RADIUS] * field[i, b, 2]
-            for k in ti.static(range(1, RADIUS + 1)):
-                above, below = ti.max(i - k, 0), ti.min(i + k, height - 1)
-                by_mean += TAPS[RADIUS + k] * (field[above, b, 0] + field[below, b, 0])
-                by_square += TAPS[RADIUS + k] * (field[above, b, 1] + field[below, b, 1])
-                by_product += TAPS[RADIUS + k] * (field[above, b, 2] + field[below, b, 2])
-            before, after = ti.max(b - 1, 0), ti.min(b + 1, last)
-            inside_l, inside_r = ti.select(b > 0, 1.0, 0.0), ti.select(b < last, 1.0, 0.0)
-            smooth_l = flow_smooth(flow, up, i, down, before) * inside_l
-            smooth_c = flow_smooth(flow, up, i, down, b)
-            smooth_r = flow_smooth(flow, up, i, down, after) * inside_r
-            step_l = flow_step(flow, up, down, before) * inside_l
-            step_c = flow_step(flow, up, down, b)
-            step_r = flow_step(flow, up, down, after) * inside_r
-            grad = shifted(smooth_l, smooth_c, smooth_r, -1) - shifted(smooth_l, smooth_c, smooth_r, 1)
-            grad += shifted(step_l, step_c, step_r, -1) + 2.0 * step_c + shifted(step_l, step_c, step_r, 1)
-            out[i, b] = scale_ssim * (by_mean + 2.0 * x[i, b] * by_square + y[i, b] * by_product) + scale_grad * grad
-
-
-@ti.kernel
-def colour_gradient(
-    colour: F3,  # [H, W, 3] rendered
-    colour_gt: F3,  # [H, W, 3]
-    opacity: F2,  # [H, W]
-    mask: F2,  # [H, W]
-    by_luma: L2,  # [H, B] from luma_gradient
+    field: L3,  # [H, B, SLOPES] from structure, 0 in the border
+    totals: F1,  # [TOTALS] of which the counts are read
     gain: ti.f32,
     bias: ti.f32,
     min_opacity: ti.f32,
-    epsilon: ti.f32,  # Charbonnier, intensity
-    scale: ti.f32,  # of the intensity term
-    g_colour: F3,  # [H, W, 3] out
-    w_colour: F2,  # [H, W] out: curvature of the intensity term by a rendered channel, the same for all three
-    sums: F2,  # [H SPLIT, 3] out: sum of the intensity penalty, derivatives by gain and by bias
-):
-    """Intensity term of Eq. 12, and the chain rule of all terms to the rendered colour, gain and bias.
-
-    The curvature is that of reweighted least squares with one weight a pixel, from the mean square of its residuals.
-    """
-    width = colour.shape[1]
-    for s in range(colour.shape[0] * SPLIT):
-        i, begin, end = segment(s, by_luma.shape[1])
-        total, by_gain, by_bias = 0.0, 0.0, 0.0
-        for b in range(begin, end):
-            luma, m, squares = by_luma[i, b], Lanes(0.0), Lanes(0.0)
-            for k in ti.static(range(LANES)):
-                j = ti.min(b * LANES + k, width - 1)
-                m[k] = ti.select((b * LANES + k < width) and (opacity[i, j] >= min_opacity), mask[i, j], 0.0)
-            for c in range(3):  # not static: a third of the code to compile
-                share = ti.select(c == 0, LUMA[0], ti.select(c == 1, LUMA[1], LUMA[2]))
-                value, r = Lanes(0.0), Lanes(0.0)
-                for k in ti.static(range(LANES)):
-                    j = ti.min(b * LANES + k, width - 1)
-                    value[k] = colour[i, j, c]
-                    r[k] = gain * value[k] + bias - colour_gt[i, j, c]
-                squares += r * r
-                root = ti.sqrt(r * r + epsilon * epsilon)
-                g = m * (scale * r / root + share * luma)
-                total += (m * (root - epsilon)).sum()
-                by_gain += (g * value).sum()
-                by_bias += g.sum()
-                for k in ti.static(range(LANES)):
-                    if b * LANES + k < width:
-                        g_colour[i, b * LANES + k, c] = gain * g[k]
-            w = m * (scale * gain * gain) / ti.sqrt(squares / 3.0 + epsilon * epsilon)
-            for k in ti.static(range(LANES)):
-                if b * LANES + k < width:
-                    w_colour[i, b * LANES + k] = w[k]
-        sums[s, 0] = total
-        sums[s, 1] = by_gain
-        sums[s, 2] = by_bias
-
-
-@ti.kernel
-def depth_gradient(
-    depth: F2,  # [H, W] m, accumulated: sum of weight times depth
-    opacity: F2,  # [H, W]
-    depth_gt: F2,  # [H, W] m, 0 = none
-    gate: F2,  # [H, W] T
-    boost: ti.f32,  # residuals count 1 + boost T
-    sigma_per_m2: ti.f32,  # 1/m
-    epsilon: ti.f32,  # Charbonnier, in standard deviations
     min_depth_opacity: ti.f32,
-    scale: ti.f32,
-    g_depth: F2,  # [H, W] out
-    g_opacity: F2,  # [H, W] out
-    w_depth: F2,  # [H, W] out: curvature by depth, 1/m^2, of reweighted least squares
-    sums: F2,  # [H SPLIT, 1] out: weighted sum of the penalty
+    epsilon_colour: ti.f32,  # Charbonnier, intensity
+    epsilon_depth: ti.f32,  # Charbonnier, in standard deviations
+    boost: ti.f32,  # depth residuals count 1 + boost T
+    sigma_per_m2: ti.f32,  # 1/m
+    weight_l1: ti.f32,
+    weight_grad: ti.f32,
+    weight_ssim: ti.f32,
+    weight_geo: ti.f32,
+    g_colour: L2,  # [H, 3 B] out
+    g_depth: L2,  # [H, B] out
+    g_opacity: L2,  # [H, B] out
+    w_colour: L2,  # [H, B] out: curvature of the intensity term by a rendered channel, the same for all three
+    w_depth: L2,  # [H, B] out: curvature by depth, 1/m^2
+    partial: F2,  # [H, TOTALS] out: L1, GAIN, BIAS, GEO
 ):
-    """Eq. 13 on depth / opacity, in standard deviations of the sensor's noise at the measured depth."""
-    for s in range(depth.shape[0] * SPLIT):
-        i, begin, end = segment(s, depth.shape[1])
-        total = 0.0
-        for j in range(begin, end):
-            by_depth, by_opacity, curvature = 0.0, 0.0, 0.0
-            z = depth_gt[i, j]
-            if z > 0.0 and opacity[i, j] > min_depth_opacity:
-                share = 1.0 / opacity[i, j]
-                rendered = depth[i, j] * share
-                per_sigma = 1.0 / (sigma_per_m2 * z * z)
-                r = (rendered - z) * per_sigma
-                root = ti.sqrt(r * r + epsilon * epsilon)
-                w = 1.0 + boost * gate[i, j]
-                total += w * (root - epsilon)
-                per_metre = per_sigma * share
-                curvature = scale * w / root * per_metre * per_metre
-                by_depth = scale * w * (r / root) * per_metre
-                by_opacity = -by_depth * rendered
-            g_depth[i, j] = by_depth
-            g_opacity[i, j] = by_opacity
-            w_depth[i, j] = curvature
-        sums[s, 0] = total
+    """Derivatives of all terms by the rendered images, gain and bias.
+
+    The curvatures are those of reweighted least squares; that of colour has one weight a pixel, from the mean square of
+    its residuals.
+    """
+    for spread in range(x.shape[0] * SPREAD):
+        i = spread // SPREAD
+        if spread - i * SPREAD == 0:
+            per_l1 = share(weight_l1, 3.0 * totals[PIXELS])
+            per_grad, per_ssim = share(weight_grad, totals[INNER]), share(weight_ssim, totals[INNER])
+            per_geo = share(weight_geo, totals[DEPTHS])
+            l1, by_gain, by_bias, geo = Lanes(0.0), Lanes(0.0), Lanes(0.0), Lanes(0.0)
+            for b in range(x.shape[1]):
+                by_luma = luma_slope(x, y, field, i, b, per_ssim, per_grad)
+                valid = ti.select(opacity[i, b] >= Lanes(min_opacity), mask[i, b], Lanes(0.0))
+                r0 = gain * colour[i, 3 * b] + bias - colour_gt[i, 3 * b]
+                r1 = gain * colour[i, 3 * b + 1] + bias - colour_gt[i, 3 * b + 1]
+                r2 = gain * colour[i, 3 * b + 2] + bias - colour_gt[i, 3 * b + 2]
+                by_luma *= valid
+                for part in ti.static(range(3)):
+                    r = ti.static((r0, r1, r2))[part]
+                    m = for_channels(valid, part)
+                    root = charbonnier_root(r * r, epsilon_colour)
+                    g = per_l1 * m * r / root + for_channels(by_luma, part) * Lanes(LUMA_PARTS[part])
+                    l1 += m * (root - epsilon_colour)
+                    by_gain += g * colour[i, 3 * b + part]
+                    by_bias += g
+                    g_colour[i, 3 * b + part] = gain * g
+                square = channel_sum(r0 * r0, r1 * r1, r2 * r2) * (1.0 / 3.0)
+                w_colour[i, b] = per_l1 * gain * gain * valid / charbonnier_root(square, epsilon_colour)
+
+                has_depth = measured(depth_gt[i, b], opacity[i, b], min_depth_opacity)
+                penalty, by_depth, by_opacity, curvature = depth_slopes(
+                    depth[i, b],
+                    ti.select(has_depth > Lanes(0.5), opacity[i, b], Lanes(1.0)),
+                    ti.select(has_depth > Lanes(0.5), depth_gt[i, b], Lanes(1.0)),
+                    has_depth * (1.0 + boost * gate[i, b]),
+                    sigma_per_m2,
+                    epsilon_depth,
+                )
+                geo += penalty
+                g_depth[i, b] = per_geo * by_depth
+                g_opacity[i, b] = per_geo * by_opacity
+                w_depth[i, b] = per_geo * curvature
+            partial[i, L1] = lane_sum(l1)
+            partial[i, GAIN] = lane_sum(by_gain)
+            partial[i, BIAS] = lane_sum(by_bias)
+            partial[i, GEO] = lane_sum(geo)
+
+
+@ti.func
+def luma_slope(x: ti.template(), y: ti.template(), field: ti.template(), i, b, per_ssim, per_grad):
+    """Derivative of both structure terms by x: the adjoint's vertical step. Rows that are clamped are border, so 0."""
+    height = x.shape[0]
+    by_mean, by_square, by_product = (
+        TAPS[RADIUS] * field[i, b, 0],
+        TAPS[RADIUS] * field[i, b, 1],
+        TAPS[RADIUS] * field[i, b, 2],
+    )
+    for k in ti.static(range(1, RADIUS + 1)):
+        above, below = ti.max(i - k, 0), ti.min(i + k, height - 1)
+        by_mean += TAPS[RADIUS + k] * (field[above, b, 0] + field[below, b, 0])
+        by_square += TAPS[RADIUS + k] * (field[above, b, 1] + field[below, b, 1])
+        by_product += TAPS[RADIUS + k] * (field[above, b, 2] + field[below, b, 2])
+    up, down = ti.max(i - 1, 0), ti.min(i + 1, height - 1)
+    smooth = field[up, b, 3] + 2.0 * field[i, b, 3] + field[down, b, 3]
+    step = field[up, b, 4] - field[down, b, 4]
+    windowed = by_mean + 2.0 * x[i, b] * by_square + y[i, b] * by_product
+    return per_ssim * windowed + 0.125 * per_grad * (smooth + step)

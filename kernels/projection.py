@@ -6,6 +6,7 @@ Columns of a splat row, and of the moments that the rasterizer's backward pass s
 
 import taichi as ti
 
+from tgslam.kernels.cuda.warp import WARP, warp_sum
 from tgslam.kernels.simd import REACH, TILE
 
 nd = ti.types.ndarray
@@ -24,7 +25,7 @@ BLUR_DEPTH = 0.03  # px^2 in the regression of depth on the pixel: BLUR would fl
 BLUR = 0.3  # px^2 added to the screen covariance, the 3DGS standard's low-pass filter
 NEAR_M = 0.05
 EDGE = 1.3  # the Jacobian is evaluated at most this many half-images off the axis
-POSE_BLOCK = 32  # Gaussians whose pose gradients one writer sums
+POSE_BLOCK = WARP  # Gaussians whose pose gradients one writer sums
 
 
 @ti.func
@@ -170,6 +171,108 @@ def project(
                 tile_count[i] = (x1 - x0 + 1) * (y1 - y0 + 1)
 
 
+@ti.func
+def gaussian_backward(
+    i,
+    mean: ti.template(),
+    log_scale: ti.template(),
+    quat: ti.template(),
+    opacity_logit: ti.template(),
+    embedding: ti.template(),
+    pose: ti.template(),
+    camera: ti.template(),
+    width,
+    height,
+    with_embedding: ti.template(),
+    moments: ti.template(),
+    grad_mean: ti.template(),
+    grad_log_scale: ti.template(),
+    grad_quat: ti.template(),
+    grad_opacity_logit: ti.template(),
+    grad_colour: ti.template(),
+    grad_embedding: ti.template(),
+    curvature: ti.template(),
+):
+    """One Gaussian's part of `project_backward`; returns its part of the pose gradient."""
+    # The forward quantities again
+    R = rotation_of_pose(pose)
+    x = R @ ti.Vector([mean[i, 0], mean[i, 1], mean[i, 2]]) + ti.Vector([pose[3], pose[7], pose[11]])
+    fx, fy = camera[0], camera[1]
+    raw = ti.Vector([quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3]])
+    inv_norm = 1.0 / raw.norm()
+    q = raw * inv_norm
+    Rq = rotation_from_quat(q[0], q[1], q[2], q[3])
+    s = ti.Vector([ti.exp(log_scale[i, k]) for k in range(3)])
+    M = axes_in_camera(R, Rq, s)
+    inv_z = 1.0 / x[2]
+    rx, ry = x[0] * inv_z, x[1] * inv_z
+    tx, ty = clamped(rx, camera[2], fx, width), clamped(ry, camera[3], fy, height)
+    j0, j1, jx, jy = fx * inv_z, fy * inv_z, -tx * fx * inv_z, -ty * fy * inv_z
+    mz = ti.Vector([M[2, 0], M[2, 1], M[2, 2]])
+    ax = ti.Vector([j0 * M[0, k] + jx * M[2, k] for k in range(3)])
+    ay = ti.Vector([j1 * M[1, k] + jy * M[2, k] for k in range(3)])
+    cxx, cxy, cyy = ax.dot(ax) + BLUR, ax.dot(ay), ay.dot(ay) + BLUR
+    inv_det = 1.0 / blurred_determinant(ax, ay, BLUR)
+    qxx, qxy, qyy = cyy * inv_det, -cxy * inv_det, cxx * inv_det
+    # Inverse covariance Q and depth slopes D mz -> rows of A = J M and the z row of M. With B = Q A and
+    # D = P A (Q with BLUR, P with BLUR_DEPTH) and the part of mz that the slopes leave, no term of a long
+    # splat is the small difference of large ones:
+    # dQ = -Q dA B^T - B dA^T Q, d(slope) = P dA rest - D dA^T slope + D dmz
+    bx, by = precision_times_rows(ax, ay, BLUR)
+    dx, dy = precision_times_rows(ax, ay, BLUR_DEPTH)
+    inv_depth_det = 1.0 / blurred_determinant(ax, ay, BLUR_DEPTH)
+    pxx, pxy, pyy = ay.dot(ay) + BLUR_DEPTH, -cxy, ax.dot(ax) + BLUR_DEPTH
+    zu, zv = mz.dot(dx), mz.dot(dy)
+    rest = mz - zu * ax - zv * ay
+    gz, gzu, gzv = moments[i, M_DEPTH], moments[i, M_DEPTH_X], moments[i, M_DEPTH_Y]
+    gu = qxx * moments[i, M_X] + qxy * moments[i, M_Y] - zu * moments[i, M_SLOPE]
+    gv = qxy * moments[i, M_X] + qyy * moments[i, M_Y] - zv * moments[i, M_SLOPE]
+    gxx, gxy, gyy = -0.5 * moments[i, M_XX], -0.5 * moments[i, M_XY], -0.5 * moments[i, M_YY]
+    gbx, gby = gxx * bx + gxy * by, gxy * bx + gyy * by
+    gmz = gzu * dx + gzv * dy
+    gax = (pxx * gzu + pxy * gzv) * inv_depth_det * rest - zu * gmz - 2.0 * (qxx * gbx + qxy * gby)
+    gay = (pxy * gzu + pyy * gzv) * inv_depth_det * rest - zv * gmz - 2.0 * (qxy * gbx + qyy * gby)
+    # Rows of A = J M -> J and M
+    m0 = ti.Vector([M[0, 0], M[0, 1], M[0, 2]])
+    m1 = ti.Vector([M[1, 0], M[1, 1], M[1, 2]])
+    gj0, gj1, gjx, gjy = gax.dot(m0), gay.dot(m1), gax.dot(mz), gay.dot(mz)
+    gm0, gm1, gm2 = j0 * gax, j1 * gay, jx * gax + jy * gay + gmz
+    # Camera-frame centre
+    inv_z2 = inv_z * inv_z
+    gx, gy = gu * j0, gv * j1
+    gzc = gz - (gu * fx * rx + gv * fy * ry) * inv_z - (gj0 * fx + gj1 * fy) * inv_z2
+    jx_by_x, jx_by_z = jacobian_gradient(gjx, fx, rx, tx, inv_z2)
+    jy_by_y, jy_by_z = jacobian_gradient(gjy, fy, ry, ty, inv_z2)
+    gp = ti.Vector([gx + jx_by_x, gy + jy_by_y, gzc + jx_by_z + jy_by_z])
+    gw = R.transpose() @ gp
+    for c in ti.static(range(3)):
+        grad_mean[i, c] += gw[c]
+    # Left perturbation: dx = w cross x + t, dM = [w] M
+    turn = x.cross(gp)
+    for k in ti.static(range(3)):
+        turn += ti.Vector([M[0, k], M[1, k], M[2, k]]).cross(ti.Vector([gm0[k], gm1[k], gm2[k]]))
+    # M = R Rq S
+    H = R.transpose() @ ti.Matrix.rows([gm0, gm1, gm2])
+    for k in ti.static(range(3)):
+        for r in ti.static(range(3)):
+            H[r, k] *= s[k]
+        # A's column k times its own gradient, and mz's, with what cancels left out
+        grad_log_scale[i, k] += 2.0 * (gmz[k] * rest[k] - gbx[k] * bx[k] - gby[k] * by[k])
+    gq = quat_gradient(H, q)
+    gq = (gq - q * gq.dot(q)) * inv_norm
+    for k in ti.static(range(4)):
+        grad_quat[i, k] += gq[k]
+    grad_opacity_logit[i] += moments[i, M_0] * sigmoid(-opacity_logit[i])
+    for k in ti.static(range(3)):
+        grad_colour[i, k] += moments[i, M_RED + k]
+        if ti.static(with_embedding):
+            e = sigmoid(embedding[i, k])
+            grad_embedding[i, k] += moments[i, M_EMBEDDING + k] * e * (1.0 - e)
+    curvature[i, 0] += moments[i, M_CURVATURE_COLOUR]
+    curvature[i, 1] += moments[i, M_CURVATURE_DEPTH]
+    return ti.Vector([turn[0], turn[1], turn[2], gp[0], gp[1], gp[2]])
+
+
 @ti.kernel
 def project_backward(
     count: ti.i32,
@@ -194,89 +297,34 @@ def project_backward(
     curvature: nd(ti.f32, ndim=2),  # [N, 2] summed residual weights: colour, depth
     grad_pose: nd(ti.f32, ndim=2),  # [blocks, 6] (rotation, translation), left perturbation of T_cw, a row a block
 ):
-    """Moments of the splats -> gradients of the Gaussians' parameters and of the pose."""
-    for block in range(grad_pose.shape[0]):
-        pose_sum = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-        for i in range(block * POSE_BLOCK, ti.min((block + 1) * POSE_BLOCK, count)):
-            if tile_count[i] > 0:
-                # The forward quantities again
-                R = rotation_of_pose(pose)
-                x = R @ ti.Vector([mean[i, 0], mean[i, 1], mean[i, 2]]) + ti.Vector([pose[3], pose[7], pose[11]])
-                fx, fy = camera[0], camera[1]
-                raw = ti.Vector([quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3]])
-                inv_norm = 1.0 / raw.norm()
-                q = raw * inv_norm
-                Rq = rotation_from_quat(q[0], q[1], q[2], q[3])
-                s = ti.Vector([ti.exp(log_scale[i, k]) for k in range(3)])
-                M = axes_in_camera(R, Rq, s)
-                inv_z = 1.0 / x[2]
-                rx, ry = x[0] * inv_z, x[1] * inv_z
-                tx, ty = clamped(rx, camera[2], fx, width), clamped(ry, camera[3], fy, height)
-                j0, j1, jx, jy = fx * inv_z, fy * inv_z, -tx * fx * inv_z, -ty * fy * inv_z
-                mz = ti.Vector([M[2, 0], M[2, 1], M[2, 2]])
-                ax = ti.Vector([j0 * M[0, k] + jx * M[2, k] for k in range(3)])
-                ay = ti.Vector([j1 * M[1, k] + jy * M[2, k] for k in range(3)])
-                cxx, cxy, cyy = ax.dot(ax) + BLUR, ax.dot(ay), ay.dot(ay) + BLUR
-                inv_det = 1.0 / blurred_determinant(ax, ay, BLUR)
-                qxx, qxy, qyy = cyy * inv_det, -cxy * inv_det, cxx * inv_det
-                # Inverse covariance Q and depth slopes D mz -> rows of A = J M and the z row of M. With B = Q A and
-                # D = P A (Q with BLUR, P with BLUR_DEPTH) and the part of mz that the slopes leave, no term of a long
-                # splat is the small difference of large ones:
-                # dQ = -Q dA B^T - B dA^T Q, d(slope) = P dA rest - D dA^T slope + D dmz
-                bx, by = precision_times_rows(ax, ay, BLUR)
-                dx, dy = precision_times_rows(ax, ay, BLUR_DEPTH)
-                inv_depth_det = 1.0 / blurred_determinant(ax, ay, BLUR_DEPTH)
-                pxx, pxy, pyy = ay.dot(ay) + BLUR_DEPTH, -cxy, ax.dot(ax) + BLUR_DEPTH
-                zu, zv = mz.dot(dx), mz.dot(dy)
-                rest = mz - zu * ax - zv * ay
-                gz, gzu, gzv = moments[i, M_DEPTH], moments[i, M_DEPTH_X], moments[i, M_DEPTH_Y]
-                gu = qxx * moments[i, M_X] + qxy * moments[i, M_Y] - zu * moments[i, M_SLOPE]
-                gv = qxy * moments[i, M_X] + qyy * moments[i, M_Y] - zv * moments[i, M_SLOPE]
-                gxx, gxy, gyy = -0.5 * moments[i, M_XX], -0.5 * moments[i, M_XY], -0.5 * moments[i, M_YY]
-                gbx, gby = gxx * bx + gxy * by, gxy * bx + gyy * by
-                gmz = gzu * dx + gzv * dy
-                gax = (pxx * gzu + pxy * gzv) * inv_depth_det * rest - zu * gmz - 2.0 * (qxx * gbx + qxy * gby)
-                gay = (pxy * gzu + pyy * gzv) * inv_depth_det * rest - zv * gmz - 2.0 * (qxy * gbx + qyy * gby)
-                # Rows of A = J M -> J and M
-                m0 = ti.Vector([M[0, 0], M[0, 1], M[0, 2]])
-                m1 = ti.Vector([M[1, 0], M[1, 1], M[1, 2]])
-                gj0, gj1, gjx, gjy = gax.dot(m0), gay.dot(m1), gax.dot(mz), gay.dot(mz)
-                gm0, gm1, gm2 = j0 * gax, j1 * gay, jx * gax + jy * gay + gmz
-                # Camera-frame centre
-                inv_z2 = inv_z * inv_z
-                gx, gy = gu * j0, gv * j1
-                gzc = gz - (gu * fx * rx + gv * fy * ry) * inv_z - (gj0 * fx + gj1 * fy) * inv_z2
-                jx_by_x, jx_by_z = jacobian_gradient(gjx, fx, rx, tx, inv_z2)
-                jy_by_y, jy_by_z = jacobian_gradient(gjy, fy, ry, ty, inv_z2)
-                gp = ti.Vector([gx + jx_by_x, gy + jy_by_y, gzc + jx_by_z + jy_by_z])
-                gw = R.transpose() @ gp
-                for c in ti.static(range(3)):
-                    grad_mean[i, c] += gw[c]
-                # Left perturbation: dx = w cross x + t, dM = [w] M
-                turn = x.cross(gp)
-                for k in ti.static(range(3)):
-                    turn += ti.Vector([M[0, k], M[1, k], M[2, k]]).cross(ti.Vector([gm0[k], gm1[k], gm2[k]]))
-                for c in ti.static(range(3)):
-                    pose_sum[c] += turn[c]
-                    pose_sum[3 + c] += gp[c]
-                # M = R Rq S
-                H = R.transpose() @ ti.Matrix.rows([gm0, gm1, gm2])
-                for k in ti.static(range(3)):
-                    for r in ti.static(range(3)):
-                        H[r, k] *= s[k]
-                    # A's column k times its own gradient, and mz's, with what cancels left out
-                    grad_log_scale[i, k] += 2.0 * (gmz[k] * rest[k] - gbx[k] * bx[k] - gby[k] * by[k])
-                gq = quat_gradient(H, q)
-                gq = (gq - q * gq.dot(q)) * inv_norm
-                for k in ti.static(range(4)):
-                    grad_quat[i, k] += gq[k]
-                grad_opacity_logit[i] += moments[i, M_0] * sigmoid(-opacity_logit[i])
-                for k in ti.static(range(3)):
-                    grad_colour[i, k] += moments[i, M_RED + k]
-                    if ti.static(with_embedding):
-                        e = sigmoid(embedding[i, k])
-                        grad_embedding[i, k] += moments[i, M_EMBEDDING + k] * e * (1.0 - e)
-                curvature[i, 0] += moments[i, M_CURVATURE_COLOUR]
-                curvature[i, 1] += moments[i, M_CURVATURE_DEPTH]
-        for c in ti.static(range(6)):
-            grad_pose[block, c] = pose_sum[c]
+    """Moments of the splats -> gradients of the Gaussians' parameters and of the pose.
+
+    A row of the pose's gradient is summed by one thread on the CPU, by one warp under CUDA, in a fixed order.
+    """
+    if ti.static(ti.cfg.arch == ti.cuda):
+        ti.loop_config(block_dim=128)  # a Gaussian takes many registers
+        for i in range(grad_pose.shape[0] * POSE_BLOCK):
+            part = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+            if i < count:
+                if tile_count[i] > 0:
+                    part = gaussian_backward(
+                        i, mean, log_scale, quat, opacity_logit, embedding, pose, camera, width, height,
+                        with_embedding, moments, grad_mean, grad_log_scale, grad_quat, grad_opacity_logit, grad_colour,
+                        grad_embedding, curvature,
+                    )  # fmt: skip
+            for c in ti.static(range(6)):
+                total = warp_sum(part[c])
+                if i % POSE_BLOCK == c:
+                    grad_pose[i // POSE_BLOCK, c] = total
+    else:
+        for block in range(grad_pose.shape[0]):
+            pose_sum = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+            for i in range(block * POSE_BLOCK, ti.min((block + 1) * POSE_BLOCK, count)):
+                if tile_count[i] > 0:
+                    pose_sum += gaussian_backward(
+                        i, mean, log_scale, quat, opacity_logit, embedding, pose, camera, width, height,
+                        with_embedding, moments, grad_mean, grad_log_scale, grad_quat, grad_opacity_logit, grad_colour,
+                        grad_embedding, curvature,
+                    )  # fmt: skip
+            for c in ti.static(range(6)):
+                grad_pose[block, c] = pose_sum[c]

@@ -6,6 +6,8 @@ The numerator is minus the loss's gradient, the denominator the curvature that t
 
 import taichi as ti
 
+from tgslam.kernels.rows import pixel_curvature
+
 nd = ti.types.ndarray
 
 
@@ -15,13 +17,14 @@ def relax(
     visible: nd(ti.i32, ndim=1),  # [N] 0 = leave the Gaussian alone
     grad_colour: nd(ti.f32, ndim=2),  # [N, 3]
     curvature: nd(ti.f32, ndim=2),  # [N, 2] the first column is the colour's
+    totals: nd(ti.f32, ndim=1),  # [TOTALS] of the loss
     step: ti.f32,  # 1 = the full step
-    floor: ti.f32,  # added to the curvature: below it, evidence moves little
+    weight: ti.f32,  # see `pixel_curvature`: that much is added to the curvature, so that little evidence moves little
     colour: nd(ti.f32, ndim=2),  # [N, 3] changed, kept in [0, 1]
 ):
     """One relaxation step of the visible Gaussians' colours."""
     for i in range(count):
         if visible[i] != 0:
-            per_colour = step / (curvature[i, 0] + floor)
+            per_colour = step / (curvature[i, 0] + pixel_curvature(totals, weight))
             for c in ti.static(range(3)):
                 colour[i, c] = ti.min(ti.max(colour[i, c] - per_colour * grad_colour[i, c], 0.0), 1.0)

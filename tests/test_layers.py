@@ -22,6 +22,7 @@ RANKS = (
     {"datasets", "slam"},
     {"evaluation", "output"},
     {"pipeline"},
+    {"bench"},
     {"cli"},
     {"__main__"},
 )

@@ -7,11 +7,19 @@ from tests.reference import relaxation as reference
 from tgslam import runtime
 from tgslam.gaussian_map import GaussianMap, MapGradient
 from tgslam.kernels import relaxation
+from tgslam.kernels.objective import PIXELS, TOTALS
 from tgslam.render import ImageGradient, Rasterizer
 from tgslam.types import Camera, Gaussians
 
 CAMERA = Camera(40, 32, 60.0, 60.0, 19.5, 15.5)
 STEP, FLOOR = 0.7, 2.0
+
+
+def totals():
+    """Sums of a loss over one pixel, so that its weight is a pixel's curvature."""
+    sums = np.zeros(TOTALS, np.float32)
+    sums[PIXELS] = 1.0
+    return runtime.to_device(sums)
 
 
 def relax(visible, grad_colour, w_colour, colour, step=STEP, floor=FLOOR):
@@ -22,7 +30,7 @@ def relax(visible, grad_colour, w_colour, colour, step=STEP, floor=FLOOR):
     colour = runtime.to_device(np.array(colour, np.float32))
     relaxation.relax(
         n, runtime.to_device(visible, np.int32), runtime.to_device(grad_colour), runtime.to_device(curvature),
-        step, floor, colour,
+        totals(), step, floor, colour,
     )  # fmt: skip
     return runtime.to_host(colour)
 
@@ -84,7 +92,9 @@ def backward_and_relax(gaussians, rasterizer, off_colour):
     gradient = MapGradient.zeros(gaussians.capacity)
     g = ImageGradient(runtime.to_device(off_colour), no, no, colour_weight=ones, depth_weight=ones)
     rasterizer.backward(gaussians, g, gradient)
-    relaxation.relax(1, rasterizer.tile_count, gradient.colour, gradient.curvature, 1.0, 0.0, gaussians.colour)
+    relaxation.relax(
+        1, rasterizer.tile_count, gradient.colour, gradient.curvature, totals(), 1.0, 0.0, gaussians.colour
+    )
 
 
 def test_one_full_step_solves_the_case_of_one_gaussian():

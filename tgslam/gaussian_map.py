@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam import runtime
+from tgslam.kernels import rows as kernels
 from tgslam.types import Gaussians
 
 _FLOAT_FIELDS = {"mean": 3, "log_scale": 3, "quat_wxyz": 4, "opacity_logit": 0, "colour": 3, "embedding": 3}
@@ -96,9 +97,8 @@ class MapGradient:
     opacity_logit: np.ndarray  # [capacity]
     colour: np.ndarray  # [capacity, 3]
     embedding: np.ndarray  # [capacity, 3]
-    curvature: (
-        np.ndarray
-    )  # [capacity, 2] sum over pixels of blend weight times the loss's second derivative: colour, depth
+    # [capacity, 2] sum over pixels of blend weight times the loss's second derivative: by colour, by depth
+    curvature: np.ndarray
 
     @classmethod
     def zeros(cls, capacity: int) -> MapGradient:
@@ -108,5 +108,7 @@ class MapGradient:
 
     def clear(self) -> None:
         """Set every gradient to zero."""
-        for name in (*PARAMETERS, "curvature"):
-            getattr(self, name).fill(0)
+        kernels.clear_gradient(
+            self.curvature.shape[0], self.mean, self.log_scale, self.quat_wxyz, self.opacity_logit, self.colour,
+            self.embedding, self.curvature,
+        )  # fmt: skip

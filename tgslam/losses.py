@@ -3,71 +3,113 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from tgslam import images, runtime
 from tgslam.arrays import require
 from tgslam.config.schema import LossConfig
-from tgslam.kernels import loss as kernels
+from tgslam.kernels.objective import BIAS, DEPTHS, GAIN, GEO, GRAD, INNER, L1, PIXELS, SSIM
+from tgslam.objective import cpu
+from tgslam.objective.images import LossImages
 
 
 @dataclass(frozen=True)
 class Observation:
-    """A keyframe's side of the objective, as device arrays, prepared once by `observe`. B = ceil(W / 16) lane blocks.
+    """A keyframe's side of the objective, as device arrays, prepared once by `observe`.
 
     The gradient term is linear before its penalty, so it needs no gradients of the observation, only its luminance.
     """
 
-    colour: np.ndarray  # [H, W, 3] RGB
-    depth_m: np.ndarray  # [H, W] 0 = none
-    mask: np.ndarray  # [H, W] M_rgb in [0, 1]
+    size: tuple[int, int]  # height and width in pixels
     gate: np.ndarray  # [H, W] T of Eq. 11
-    luma: np.ndarray  # [H, B, 16]
-    texture: np.ndarray  # [H, B, 16] 1 - T, 0 in the border of 5 px
-    statistics: np.ndarray  # [H, B, 2, 16] windowed mean and variance of luma
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width in pixels."""
-        height, width = self.depth_m.shape
-        return height, width
+    prepared: cpu.CpuObservation  # in the form of the device's kernels
 
 
 @dataclass(frozen=True)
 class LossResult:
-    """The objective at one rendering. With a shared `Workspace`, the arrays are overwritten by its next use."""
+    """The objective at one rendering. Its arrays are overwritten by the next use of the same `Workspace`.
 
-    value: float  # weight_pho E_pho + weight_geo E_geo
-    parts: dict[str, float]  # means before weighting: l1, grad, ssim, geo; pixels counted: pixels, depths
-    g_colour: np.ndarray  # [H, W, 3] derivative by rendered colour
-    g_depth: np.ndarray  # [H, W] by accumulated depth, 1/m
-    g_opacity: np.ndarray  # [H, W] by accumulated opacity
-    g_gain: float
-    g_bias: float
-    w_colour: np.ndarray  # [H, W] curvature of the intensity term by a rendered channel (reweighted least squares)
-    w_depth: np.ndarray  # [H, W] curvature of E_geo by accumulated depth, 1/m^2
+    Numbers stay on the device until one of them is asked for, which copies them all, once.
+    """
+
+    config: LossConfig
+    images: LossImages
+
+    @property
+    def g_colour(self) -> np.ndarray:
+        """[H, W, 3] derivative by rendered colour."""
+        return self.images.colour
+
+    @property
+    def g_depth(self) -> np.ndarray:
+        """[H, W] by accumulated depth, 1/m."""
+        return self.images.depth
+
+    @property
+    def g_opacity(self) -> np.ndarray:
+        """[H, W] by accumulated opacity."""
+        return self.images.opacity
+
+    @property
+    def w_colour(self) -> np.ndarray:
+        """[H, W] curvature of the intensity term by a rendered channel (reweighted least squares)."""
+        return self.images.w_colour
+
+    @property
+    def w_depth(self) -> np.ndarray:
+        """[H, W] curvature of E_geo by accumulated depth, 1/m^2."""
+        return self.images.w_depth
+
+    @property
+    def totals(self) -> np.ndarray:
+        """Device array of the sums over the image (kernels/objective.py), for kernels that go on from here."""
+        return self.images.totals
+
+    @cached_property
+    def parts(self) -> dict[str, float]:
+        """Means before weighting: l1, grad, ssim, geo; pixels counted: pixels, depths."""
+        pixels, inner, depths = (self._sums[column] for column in (PIXELS, INNER, DEPTHS))
+        return {
+            "l1": _mean(self._sums[L1], 3.0 * pixels),
+            "grad": _mean(self._sums[GRAD], inner),
+            "ssim": _mean(self._sums[SSIM], inner),
+            "geo": _mean(self._sums[GEO], depths),
+            "pixels": pixels,
+            "depths": depths,
+        }
+
+    @property
+    def value(self) -> float:
+        """weight_pho E_pho + weight_geo E_geo."""
+        config, parts = self.config, self.parts
+        photometric = (
+            config.weight_l1 * parts["l1"] + config.weight_grad * parts["grad"] + config.weight_ssim * parts["ssim"]
+        )
+        return config.weight_pho * photometric + config.weight_geo * parts["geo"]
+
+    @property
+    def g_gain(self) -> float:
+        """Derivative by the gain."""
+        return self._sums[GAIN]
+
+    @property
+    def g_bias(self) -> float:
+        """Derivative by the bias."""
+        return self._sums[BIAS]
+
+    @cached_property
+    def _sums(self) -> list[float]:
+        return [float(total) for total in runtime.to_host(self.images.totals)]
 
 
 class Workspace:
     """Scratch and output arrays for one image size; pass it on to save their allocation in a loop."""
 
     def __init__(self, height: int, width: int) -> None:
-        blocks = -(-width // kernels.LANES)
         self.size = (height, width)
-        self.x = _lanes(height, blocks)
-        self.weight = _lanes(height, blocks)
-        self.by_luma = _lanes(height, blocks)
-        self.flow = _lanes(height, blocks, 2)
-        self.field = _lanes(height, blocks, 3)
-        self.blurred = _lanes(height, blocks, 3)
-        self.g_colour = runtime.empty((height, width, 3))
-        self.g_depth = runtime.empty((height, width))
-        self.g_opacity = runtime.empty((height, width))
-        self.w_colour = runtime.empty((height, width))
-        self.w_depth = runtime.empty((height, width))
-        self.sums1 = runtime.empty((height * kernels.SPLIT, 1))
-        self.sums3 = runtime.empty((height * kernels.SPLIT, 3))
+        self.passes = cpu.CpuObjective(height, width)
 
 
 def observe(
@@ -88,14 +130,7 @@ def observe(
         mask.fill(1.0)
     require("mask", mask, (height, width))
     gate = images.texture_gate(images.luminance(colour), config.gate_percentile, config.gate_noise_floor)
-    blocks = -(-width // kernels.LANES)
-    luma, texture = _lanes(height, blocks), _lanes(height, blocks)
-    kernels.pack_luminance(colour, luma)
-    kernels.pack_texture(gate, texture)
-    field, statistics = _lanes(height, blocks, 2), _lanes(height, blocks, 2)
-    kernels.blur_luma(luma, field)
-    kernels.luma_statistics(field, statistics)
-    return Observation(colour, depth_m, mask, gate, luma, texture, statistics)
+    return Observation((height, width), gate, cpu.observe(colour, depth_m, mask, gate))
 
 
 def rgbd_loss(
@@ -130,56 +165,9 @@ def rgbd_loss(
     work = workspace or Workspace(height, width)
     if work.size != (height, width):
         raise ValueError(f"the workspace is for images of {list(work.size)} pixels, not {[height, width]}")
-    kernels.mix(
-        colour, opacity, observation.depth_m, observation.mask, observation.luma, observation.texture,
-        gain, bias, min_opacity, config.min_depth_opacity, work.x, work.weight, work.sums3,
-    )  # fmt: skip
-    pixels, inner, depths = _totals(work.sums3)
-    per_pixel, per_inner, per_depth = (1.0 / n if n > 0 else 0.0 for n in (3.0 * pixels, inner, depths))
-    ssim, grad = _structure(observation, config, per_inner, work)
-    kernels.colour_gradient(
-        colour, observation.colour, opacity, observation.mask, work.by_luma, gain, bias, min_opacity,
-        config.charbonnier_colour, config.weight_pho * config.weight_l1 * per_pixel, work.g_colour, work.w_colour,
-        work.sums3,
-    )  # fmt: skip
-    l1, g_gain, g_bias = _totals(work.sums3)
-    kernels.depth_gradient(
-        depth, opacity, observation.depth_m, observation.gate, config.gate_depth_boost, config.depth_sigma_per_m2,
-        config.charbonnier_depth_sigmas, config.min_depth_opacity, config.weight_geo * per_depth,
-        work.g_depth, work.g_opacity, work.w_depth, work.sums1,
-    )  # fmt: skip
-    (geo,) = _totals(work.sums1)
-    parts = {"l1": l1 * per_pixel, "grad": grad * per_inner, "ssim": ssim * per_inner, "geo": geo * per_depth}
-    photometric = (
-        config.weight_l1 * parts["l1"] + config.weight_grad * parts["grad"] + config.weight_ssim * parts["ssim"]
-    )
-    value = config.weight_pho * photometric + config.weight_geo * parts["geo"]
-    parts |= {"pixels": pixels, "depths": depths}
-    return LossResult(
-        value, parts, work.g_colour, work.g_depth, work.g_opacity, g_gain, g_bias, work.w_colour, work.w_depth
-    )
+    gradients = work.passes.evaluate(colour, depth, opacity, observation.prepared, config, gain, bias, min_opacity)
+    return LossResult(config, gradients)
 
 
-def _structure(observation: Observation, config: LossConfig, per_inner: float, work: Workspace) -> tuple[float, float]:
-    """Weighted sums of 1 - SSIM and of the gradient penalty; leaves their derivative by luminance in the workspace."""
-    kernels.blur_moments(work.x, observation.luma, work.field)
-    kernels.ssim(work.field, observation.statistics, work.weight, work.blurred, work.sums1)
-    (ssim,) = _totals(work.sums1)
-    kernels.blur_rows(work.blurred, work.field)
-    kernels.sobel_flow(work.x, observation.luma, work.weight, config.charbonnier_grad, work.flow, work.sums1)
-    (grad,) = _totals(work.sums1)
-    scale = config.weight_pho * per_inner
-    kernels.luma_gradient(
-        work.x, observation.luma, work.field, work.flow, scale * config.weight_ssim, scale * config.weight_grad,
-        work.by_luma,
-    )  # fmt: skip
-    return ssim, grad
-
-
-def _lanes(*shape: int) -> np.ndarray:
-    return runtime.empty((*shape, kernels.LANES), lanes=True)
-
-
-def _totals(sums: np.ndarray) -> list[float]:
-    """Column sums of the kernels' partial sums, in float64 and in a fixed order."""
-    return [float(total) for total in runtime.to_host(sums).sum(axis=0, dtype=np.float64)]
+def _mean(total: float, count: float) -> float:
+    return total / count if count > 0 else 0.0

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from tgslam import runtime
 from tgslam.gaussian_map import GaussianMap, MapGradient
 from tgslam.splatting.cpu import CpuSplatting
+from tgslam.splatting.cuda import CudaSplatting
 from tgslam.splatting.images import ImageGradient, RenderImages
 from tgslam.stopwatch import Stopwatch
 from tgslam.types import Camera, Gaussians, Rendering
@@ -57,7 +58,8 @@ class Rasterizer:
         )
         self._pose = runtime.zeros((12,))
         self._with_embedding = False
-        self._splatting: Splatting = CpuSplatting(camera, stopwatch)
+        splatting = CudaSplatting if runtime.device() is runtime.Device.CUDA else CpuSplatting
+        self._splatting: Splatting = splatting(camera, stopwatch)
 
     def forward(self, gaussians: GaussianMap, T_cw: ArrayLike, *, with_embedding: bool = False) -> RenderImages:
         """Render the map from the pose T_cw [4, 4] (world to camera).
@@ -68,7 +70,7 @@ class Rasterizer:
         if T_cw.shape != (4, 4) or not np.isfinite(T_cw).all():
             raise ValueError(f"T_cw must be a finite [4, 4] matrix, got shape {T_cw.shape}")
         self._with_embedding = with_embedding
-        self._pose = runtime.to_device(T_cw[:3].reshape(12))
+        runtime.upload(T_cw[:3].reshape(12), self._pose)
         self._splatting.forward(gaussians, self._pose, with_embedding, self._images)
         return self._images
 

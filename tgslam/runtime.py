@@ -41,9 +41,7 @@ def start(device: Device = Device.AUTO, threads: int = 0) -> Device:
                 f"the kernels already run on {_Runtime.device.value}; start a new process to use {wanted.value}"
             )
         return wanted
-    threads = threads or len(
-        os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
-    )
+    threads = threads or available_threads()
     ti.init(
         arch=ti.cuda if wanted is Device.CUDA else ti.cpu,
         default_ip=ti.i32,
@@ -59,6 +57,11 @@ def start(device: Device = Device.AUTO, threads: int = 0) -> Device:
         raise DeviceError("no CUDA device was found; use --device cpu, or check the driver with `nvidia-smi`")
     _Runtime.device, _Runtime.threads = wanted, threads
     return wanted
+
+
+def available_threads() -> int:
+    """CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def device() -> Device:
@@ -100,6 +103,15 @@ def to_device(array: ArrayLike, dtype: type = np.float32) -> np.ndarray:
     result = empty(host.shape, dtype)
     result.from_numpy(host)  # type: ignore[attr-defined]
     return result
+
+
+def upload(array: ArrayLike, into: np.ndarray) -> None:
+    """Copy a host array into a device array of the same shape and of float32."""
+    host: np.ndarray = np.ascontiguousarray(array, np.float32)
+    if device() is Device.CPU:
+        into[...] = host
+    else:
+        into.from_numpy(host)  # type: ignore[attr-defined]
 
 
 def to_host(array: np.ndarray) -> np.ndarray:

@@ -12,7 +12,8 @@ from collections.abc import Sequence
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # stdout is for results; read when taichi is imported
 
 from tgslam import __version__
-from tgslam.cli import doctor, evaluate, render, run
+from tgslam.cli import bench, doctor, evaluate, render, run
+from tgslam.cli.options import add_log_options
 from tgslam.errors import TgslamError
 from tgslam.output.console import error_console, set_up_logging
 
@@ -56,10 +57,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"tgslam {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    for module in (run, evaluate, render, doctor):
+    for module in (run, evaluate, render, bench, doctor):
         command = module.add_parser(commands)
-        command.add_argument("--debug", action="store_true", help="show tracebacks and debugging log lines")
-        command.add_argument("--quiet", action="store_true", help="no progress, and log lines for warnings only")
+        add_log_options(command)
         command.set_defaults(execute=module.execute)
     return parser
 

@@ -19,12 +19,12 @@ def add_device_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def start_device(name: str) -> str:
-    """Start the kernels on device `name` and return the one in use. Raises DeviceError."""
+def start_device(name: str, threads: int = 0) -> str:
+    """Start the kernels on device `name` and return the one in use; 0 threads = all cores. Raises DeviceError."""
     from tgslam.runtime import Device, start
 
     with contextlib.redirect_stdout(io.StringIO()):  # Taichi prints a line that belongs to no result
-        return start(Device(name)).value
+        return start(Device(name), threads).value
 
 
 def make_system(camera: Camera, config: Config) -> System:

@@ -10,7 +10,7 @@ from tgslam.config.loader import load
 from tgslam.config.schema import Config
 from tgslam.datasets import FrameRange, open_source
 from tgslam.datasets.lists import ASSOCIATION_FILES, find_association_file
-from tgslam.datasets.source import RgbdSource
+from tgslam.datasets.source import RgbdSource, parse_frame_slice
 from tgslam.errors import ConfigError
 
 _log = logging.getLogger(__name__)
@@ -53,6 +53,14 @@ def guess_format(folder: Path) -> str:
         )
     first = next((line for line in _lines(associations) if line.strip() and not line.startswith("#")), "")
     return "icl" if first.split(maxsplit=1)[:1] and first.split()[0].isdecimal() else "tum"
+
+
+def parse_frames(text: str | None) -> Frames:
+    """--frames START:STOP:STEP as its parts; None = every frame. Raises ConfigError."""
+    if text is None:
+        return (None, None, None)
+    frames = parse_frame_slice(text)
+    return (frames.start, frames.stop, frames.step)
 
 
 def open_frames(config: Config, input_dir: Path | None, frames: Frames) -> RgbdSource:

@@ -12,11 +12,11 @@ from typing import Any
 
 from tgslam import __version__, pipeline
 from tgslam.cli import engine
-from tgslam.cli.inputs import Frames, open_frames, resolve_config
+from tgslam.cli.inputs import open_frames, parse_frames, resolve_config
 from tgslam.cli.interrupt import StopRequest
 from tgslam.cli.summary import print_metrics
 from tgslam.config.schema import Config
-from tgslam.datasets.source import RgbdSource, parse_frame_slice
+from tgslam.datasets.source import RgbdSource
 from tgslam.errors import TgslamError
 from tgslam.evaluation.run_metrics import complete, evaluate_run, peak_rss_mb
 from tgslam.output.console import error_console
@@ -53,7 +53,7 @@ def execute(args: argparse.Namespace) -> int:
     """Do the run and evaluate it; 130 when it was stopped early."""
     started_s = time.perf_counter()
     config = resolve_config(args.config, args.input, args.set)
-    frames = _frames(args.frames)
+    frames = parse_frames(args.frames)
     device = engine.start_device(args.device)
     source = open_frames(config, args.input, frames)
     path = args.output or fresh_folder(Path("runs"), source.name, datetime.now())
@@ -126,13 +126,6 @@ def _groundtruth(source: RgbdSource) -> Trajectory | None:
     except TgslamError as error:
         _log.warning("the trajectory metrics are null: %s", error)
         return None
-
-
-def _frames(text: str | None) -> Frames:
-    if text is None:
-        return (None, None, None)
-    frames = parse_frame_slice(text)
-    return (frames.start, frames.stop, frames.step)
 
 
 def _mark_failed(folder: RunFolder, record: RunRecord, error: BaseException) -> None:

@@ -13,8 +13,10 @@ from tgslam.gaussian_map import GaussianMap, MapGradient
 from tgslam.geometry import orthonormalized, se3_exp
 from tgslam.kernels import relaxation
 from tgslam.mapping.keyframe import Keyframe
+from tgslam.mapping.sightings import Sightings
 from tgslam.optim import Adam
 from tgslam.render import ImageGradient, Rasterizer
+from tgslam.stopwatch import Stopwatch, stage
 from tgslam.types import Camera
 from tgslam.vector_adam import VectorAdam
 
@@ -24,80 +26,92 @@ _GEOMETRY = {"mean": 3, "log_scale": 3, "quat_wxyz": 4, "opacity_logit": 0}
 class Refiner:
     """One view at a time: render, compare, step. Colours relax, the rest moves by Adam."""
 
-    def __init__(self, camera: Camera, config: MappingConfig, loss: LossConfig) -> None:
-        self.config, self.loss = config, loss
+    def __init__(
+        self, camera: Camera, config: MappingConfig, loss: LossConfig, stopwatch: Stopwatch | None = None
+    ) -> None:
+        """stopwatch: takes the seconds of the stages forward, loss, backward and update, for benchmarks."""
+        self.config, self.loss, self.stopwatch = config, loss, stopwatch
         self.rasterizer = Rasterizer(camera)
-        channels, rates = (
-            dict(_GEOMETRY),
-            {
-                "mean": config.rate_mean_px / camera.fx,
-                "log_scale": config.rate_scale,
-                "quat_wxyz": config.rate_rotation,
-                "opacity_logit": config.rate_opacity,
-            },
-        )
-        if config.optimizer == "adam":
-            channels["colour"], rates["colour"] = 3, config.rate_colour
-        self.adam = Adam(channels, rates)
-        self.contribution: NDArray[np.float32] = np.zeros(0, np.float32)  # [N] px, since birth the most of any view
-        self.views: NDArray[np.int32] = np.zeros(0, np.int32)  # [N] views rendered with the Gaussian in sight
+        self.adam = _optimiser(config, camera)
+        self._sightings = Sightings()
         self._gradient = MapGradient.zeros(1)
         self._workspace = losses.Workspace(camera.height, camera.width)
         self._observations: OrderedDict[int, losses.Observation] = OrderedDict()
         self._pose_steps: dict[int, VectorAdam] = {}
 
+    @property
+    def contribution(self) -> NDArray[np.float32]:
+        """[N] px, since birth the most blend weight of each Gaussian in any view."""
+        return self._sightings.contribution
+
+    @property
+    def views(self) -> NDArray[np.int32]:
+        """[N] views rendered with the Gaussian in sight."""
+        return self._sightings.views
+
     def append(self, rows: int) -> None:
         """The map has grown by that many rows."""
         self.adam.append(rows)
-        self.contribution = np.concatenate([self.contribution, np.zeros(rows, np.float32)])
-        self.views = np.concatenate([self.views, np.zeros(rows, np.int32)])
+        self._sightings.append(rows)
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """The map has lost the rows where the mask [N] is false."""
         self.adam.keep(mask)
-        self.contribution, self.views = self.contribution[mask], self.views[mask]
+        self._sightings.keep(mask)
 
-    def step(self, gaussians: GaussianMap, keyframe: Keyframe, *, move_pose: bool) -> float:
-        """Render the map at the keyframe, and move the map (and the keyframe's pose) downhill. Returns the loss."""
+    def step(self, gaussians: GaussianMap, keyframe: Keyframe, *, move_pose: bool) -> losses.LossResult:
+        """Render the map at the keyframe, and move the map (and the keyframe's pose) downhill.
+
+        Returns the loss before the step; its numbers can be read until the next step. Only the pose's gradient goes to
+        the host by itself.
+        """
         observation = self._observation(keyframe)
         gain, bias = 1.0 / keyframe.exposure.gain, -keyframe.exposure.bias / keyframe.exposure.gain
-        rendered = self.rasterizer.forward(gaussians, keyframe.T_cw)
-        result = losses.rgbd_loss(
-            rendered.colour, rendered.depth, rendered.opacity, observation, self.loss, gain, bias,
-            workspace=self._workspace,
-        )  # fmt: skip
-        scale_colour = self.loss.weight_pho * self.loss.weight_l1 / (3.0 * max(result.parts["pixels"], 1.0))
+        with stage(self.stopwatch, "forward"):
+            rendered = self.rasterizer.forward(gaussians, keyframe.T_cw)
+        with stage(self.stopwatch, "loss"):
+            loss = losses.rgbd_loss(
+                rendered.colour, rendered.depth, rendered.opacity, observation, self.loss, gain, bias,
+                workspace=self._workspace,
+            )  # fmt: skip
+        with stage(self.stopwatch, "backward"):
+            g_pose = self._backward(gaussians, loss)
+        with stage(self.stopwatch, "update"):
+            self._update_map(gaussians, loss)
+            if move_pose:
+                self._update_pose(keyframe, g_pose)
+        return loss
+
+    def _backward(self, gaussians: GaussianMap, loss: losses.LossResult) -> NDArray[np.float64]:
+        """Fill the map's gradient; returns the pose's [6]."""
         if self._gradient.mean.shape[0] != gaussians.capacity:
             self._gradient = MapGradient.zeros(gaussians.capacity)
         else:
             self._gradient.clear()
         g = ImageGradient(
-            result.g_colour, result.g_depth, result.g_opacity,
-            colour_weight=result.w_colour, depth_weight=result.w_depth,
-        )  # fmt: skip
-        g_pose = self.rasterizer.backward(gaussians, g, self._gradient)
-        self._update_map(gaussians, scale_colour)
-        if move_pose:
-            adam = self._pose_steps.setdefault(keyframe.index, VectorAdam([self.config.rate_pose] * 6))
-            keyframe.T_cw = orthonormalized(se3_exp(adam.step(g_pose)) @ keyframe.T_cw)
-        return result.value
+            loss.g_colour, loss.g_depth, loss.g_opacity, colour_weight=loss.w_colour, depth_weight=loss.w_depth
+        )
+        return self.rasterizer.backward(gaussians, g, self._gradient)
 
-    def _update_map(self, gaussians: GaussianMap, scale_colour: float) -> None:
-        n, gradient = gaussians.count, self._gradient
+    def _update_map(self, gaussians: GaussianMap, loss: losses.LossResult) -> None:
+        gradient, visible = self._gradient, self.rasterizer.tile_count
         names = list(self.adam.learning_rates)
         self.adam.step(
             {name: getattr(gaussians, name) for name in names},
             {name: getattr(gradient, name) for name in names},
-            self.rasterizer.tile_count,
+            visible,
         )
+        weight = self.loss.weight_pho * self.loss.weight_l1 / (3.0 * self.loss.charbonnier_colour)
         if self.config.optimizer == "relaxation":
             relaxation.relax(
-                n, self.rasterizer.tile_count, gradient.colour, gradient.curvature, self.config.relaxation,
-                scale_colour / self.loss.charbonnier_colour, gaussians.colour,
+                gaussians.count, visible, gradient.colour, gradient.curvature, loss.totals, self.config.relaxation,
+                weight, gaussians.colour,
             )  # fmt: skip
-        weight_px = runtime.to_host(gradient.curvature)[:n, 0] * (self.loss.charbonnier_colour / scale_colour)
-        self.contribution = np.maximum(self.contribution, weight_px)
-        self.views += self.rasterizer.visible(n)
+        self._sightings.record(visible, gradient.curvature, loss.totals, weight)
+
+    def _update_pose(self, keyframe: Keyframe, g_pose: NDArray[np.float64]) -> None:
+        adam = self._pose_steps.setdefault(keyframe.index, VectorAdam([self.config.rate_pose] * 6))
+        keyframe.T_cw = orthonormalized(se3_exp(adam.step(g_pose)) @ keyframe.T_cw)
 
     def _observation(self, keyframe: Keyframe) -> losses.Observation:
         """The keyframe's side of the loss; the most recently used are kept."""
@@ -109,3 +123,17 @@ class Refiner:
         while len(self._observations) > self.config.window + self.config.window_random:
             self._observations.popitem(last=False)
         return cached
+
+
+def _optimiser(config: MappingConfig, camera: Camera) -> Adam:
+    """Adam for the geometry, and for colours unless they relax."""
+    channels = dict(_GEOMETRY)
+    rates = {
+        "mean": config.rate_mean_px / camera.fx,
+        "log_scale": config.rate_scale,
+        "quat_wxyz": config.rate_rotation,
+        "opacity_logit": config.rate_opacity,
+    }
+    if config.optimizer == "adam":
+        channels["colour"], rates["colour"] = 3, config.rate_colour
+    return Adam(channels, rates)

@@ -53,3 +53,23 @@ def print_table(title: str, rows: Mapping[str, str] | Sequence[tuple[str, str]])
     print(title)
     for name, value in pairs:
         print(f"  {name:<{width}}  {value}")
+
+
+def print_columns(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """A table of several columns to stdout, numbers to the right: drawn in a terminal, else aligned with spaces."""
+    if sys.stdout.isatty():
+        table = Table(title=title, title_justify="left")
+        for number, name in enumerate(header):
+            table.add_column(name, justify="right" if number else "left")
+        for row in rows:
+            table.add_row(*row)
+        Console().print(table, markup=False)
+        return
+    widths = [max(len(cell) for cell in column) for column in zip(header, *rows, strict=True)]
+    print(title)
+    for row in (header, *rows):
+        cells = [
+            cell.rjust(width) if n else cell.ljust(width)
+            for n, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        print("  " + "  ".join(cells).rstrip())

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
@@ -94,3 +95,18 @@ class _LineObserver:
             _log.info("frame %d of %d: %s", counts.frames, counts.total, counts)
             self._next_frames = counts.frames + _LINE_FRACTION * counts.total
             self._next_s = time.monotonic() + _LINE_INTERVAL_S
+
+
+@contextmanager
+def step_progress(what: str, total: int, console: Console, quiet: bool) -> Iterator[Callable[[str], None]]:
+    """A function to call with the name of each of the `total` steps as it begins, for as long as the block lasts."""
+    if quiet:
+        yield lambda name: None
+    elif console.is_terminal:
+        columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
+        with Progress(*columns, console=console) as bar:
+            task = bar.add_task("", total=total, completed=-1)
+            yield lambda name: bar.update(task, advance=1, description=name)
+    else:
+        steps = itertools.count(1)
+        yield lambda name: _log.info("%s %d of %d: %s", what, next(steps), total, name)

@@ -7,6 +7,7 @@ import numpy as np
 from tests.cuda.harness import scenario
 from tgslam import runtime
 from tgslam.kernels import relaxation
+from tgslam.kernels.objective import TOTALS
 
 
 @scenario
@@ -17,6 +18,7 @@ def colours(count: int = 300) -> dict[str, np.ndarray]:
     colour = runtime.to_device(rng.random((count, 3)))
     relaxation.relax(
         count, runtime.to_device(rng.integers(0, 3, count), np.int32), runtime.to_device(gradient),
-        runtime.to_device(10.0 ** rng.uniform(-1, 3, (count, 2))), 0.7, 2.0, colour,
+        runtime.to_device(10.0 ** rng.uniform(-1, 3, (count, 2))), runtime.to_device(np.full(TOTALS, 300.0)),
+        0.7, 600.0, colour,
     )  # fmt: skip
     return {"colour": runtime.to_host(colour)}

@@ -1,0 +1,1 @@
+"""The passes of the objective on each device, behind one interface."""
