@@ -193,7 +193,10 @@ def gaussian_backward(
     grad_embedding: ti.template(),
     curvature: ti.template(),
 ):
-    """One Gaussian's part of `project_backward`; returns its part of the pose gradient."""
+    """One Gaussian's part of `project_backward`; returns its part of the pose gradient.
+
+    Sums into arrays are written out, since `+=` on an array element is an atomic addition, on the CPU a locked loop.
+    """
     # The forward quantities again
     R = rotation_of_pose(pose)
     x = R @ ti.Vector([mean[i, 0], mean[i, 1], mean[i, 2]]) + ti.Vector([pose[3], pose[7], pose[11]])
@@ -246,7 +249,7 @@ def gaussian_backward(
     gp = ti.Vector([gx + jx_by_x, gy + jy_by_y, gzc + jx_by_z + jy_by_z])
     gw = R.transpose() @ gp
     for c in ti.static(range(3)):
-        grad_mean[i, c] += gw[c]
+        grad_mean[i, c] = grad_mean[i, c] + gw[c]
     # Left perturbation: dx = w cross x + t, dM = [w] M
     turn = x.cross(gp)
     for k in ti.static(range(3)):
@@ -257,19 +260,20 @@ def gaussian_backward(
         for r in ti.static(range(3)):
             H[r, k] *= s[k]
         # A's column k times its own gradient, and mz's, with what cancels left out
-        grad_log_scale[i, k] += 2.0 * (gmz[k] * rest[k] - gbx[k] * bx[k] - gby[k] * by[k])
+        gs = gmz[k] * rest[k] - gbx[k] * bx[k] - gby[k] * by[k]
+        grad_log_scale[i, k] = grad_log_scale[i, k] + 2.0 * gs
     gq = quat_gradient(H, q)
     gq = (gq - q * gq.dot(q)) * inv_norm
     for k in ti.static(range(4)):
-        grad_quat[i, k] += gq[k]
-    grad_opacity_logit[i] += moments[i, M_0] * sigmoid(-opacity_logit[i])
+        grad_quat[i, k] = grad_quat[i, k] + gq[k]
+    grad_opacity_logit[i] = grad_opacity_logit[i] + moments[i, M_0] * sigmoid(-opacity_logit[i])
     for k in ti.static(range(3)):
-        grad_colour[i, k] += moments[i, M_RED + k]
+        grad_colour[i, k] = grad_colour[i, k] + moments[i, M_RED + k]
         if ti.static(with_embedding):
             e = sigmoid(embedding[i, k])
-            grad_embedding[i, k] += moments[i, M_EMBEDDING + k] * e * (1.0 - e)
-    curvature[i, 0] += moments[i, M_CURVATURE_COLOUR]
-    curvature[i, 1] += moments[i, M_CURVATURE_DEPTH]
+            grad_embedding[i, k] = grad_embedding[i, k] + moments[i, M_EMBEDDING + k] * e * (1.0 - e)
+    curvature[i, 0] = curvature[i, 0] + moments[i, M_CURVATURE_COLOUR]
+    curvature[i, 1] = curvature[i, 1] + moments[i, M_CURVATURE_DEPTH]
     return ti.Vector([turn[0], turn[1], turn[2], gp[0], gp[1], gp[2]])
 
 
