@@ -6,6 +6,7 @@ that count), the very source of a kernel says how much arithmetic it does on eac
 
 from __future__ import annotations
 
+import inspect
 import types
 from collections import Counter
 from collections.abc import Callable
@@ -54,6 +55,7 @@ Lanes.__sub__, Lanes.__truediv__ = _subtract, _divide  # type: ignore[attr-defin
 Lanes.__rsub__ = lambda a, b: _subtract(b, a)  # type: ignore[attr-defined]
 Lanes.__rtruediv__ = lambda a, b: _divide(b, a)  # type: ignore[attr-defined]
 Lanes.__lt__ = _counted("compare", lambda a, b: a < b)  # type: ignore[method-assign]
+Lanes.__le__ = _counted("compare", lambda a, b: a <= b)  # type: ignore[method-assign]
 Lanes.__gt__ = _counted("compare", lambda a, b: a > b)  # type: ignore[method-assign]
 
 
@@ -61,23 +63,34 @@ def _clz(bits: int) -> int:
     return 32 - int(bits).bit_length()
 
 
+def _select(condition: Any, yes: Any, no: Any) -> Any:
+    return np.where(condition, yes, no) if np.ndim(condition) else yes if condition else no
+
+
 _TAICHI = types.SimpleNamespace(
     min=_counted("min", np.minimum),
     max=_counted("max", np.maximum),
-    select=_counted("select", np.where),
+    sqrt=_counted("sqrt", np.sqrt),
+    select=_counted("select", _select),
     static=lambda x: x,
-    cast=lambda x, dtype: x,
+    cast=lambda x, dtype: dtype(x),
     math=types.SimpleNamespace(clz=_clz),
-    f32=None,
-    i32=None,
+    f32=float,
+    i32=int,
 )
+
+
+def source_of(function: Callable[..., Any]) -> types.FunctionType:
+    """The Python function below Taichi's decorators and ours."""
+    while hasattr(function, "__wrapped__"):
+        function = function.__wrapped__
+    assert isinstance(function, types.FunctionType)
+    return function
 
 
 def in_python(function: Callable[..., Any]) -> Callable[..., Any]:
     """The source of a `lanes_kernel` or `ti.func` as a Python function; what it calls is translated too."""
-    source: Any = function
-    while hasattr(source, "__wrapped__"):
-        source = source.__wrapped__
+    source = source_of(function)
     names: dict[str, Any] = dict(source.__globals__)
     for name in source.__code__.co_names:
         if getattr(names.get(name), "_is_taichi_function", False):
@@ -98,8 +111,12 @@ class LaneArray:
         self.values[index] = value.v
 
 
-def arithmetic_of(run: Callable[[], object]) -> int:
-    """Additions, subtractions, multiplications and divisions that `run` does on each lane."""
+def arithmetic_of(kernel: Callable[..., Any], known: dict[str, Any]) -> int:
+    """Additions, subtractions, multiplications and divisions that a call of the kernel does on each lane.
+
+    known: the kernel's arguments by name, and maybe others.
+    """
+    arguments = {name: known[name] for name in inspect.signature(source_of(kernel)).parameters}
     Lanes.counts.clear()
-    run()
+    in_python(kernel)(**arguments)
     return sum(Lanes.counts[name] for name in ARITHMETIC)

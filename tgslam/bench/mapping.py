@@ -12,7 +12,6 @@ from tgslam.config.schema import LossConfig, MappingConfig
 from tgslam.gaussian_map import GaussianMap
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.refinement import Refiner
-from tgslam.render import Rasterizer
 from tgslam.stopwatch import Stopwatch
 from tgslam.tracking.exposure import Exposure
 from tgslam.types import Frame
@@ -26,8 +25,7 @@ def measure(scene: Scene, frame: Frame, repeats: int) -> dict[str, Any]:
     The map moves a little in every iteration, as it does in a run.
     """
     stopwatch = Stopwatch()
-    refiner = Refiner(scene.camera, MappingConfig(), LossConfig())
-    refiner.rasterizer = Rasterizer(scene.camera, stopwatch)
+    refiner = Refiner(scene.camera, MappingConfig(), LossConfig(), stopwatch)
     gaussians = GaussianMap.from_gaussians(scene.gaussians)
     refiner.append(gaussians.count)
     keyframe = Keyframe.from_frame(frame, np.eye(4), Exposure(), np.eye(6))
@@ -42,5 +40,5 @@ def measure(scene: Scene, frame: Frame, repeats: int) -> dict[str, Any]:
         "height": scene.camera.height,
         "gaussians": gaussians.count,
         "pairs": refiner.rasterizer.pair_count,
-        **samples.report(rest="loss and update"),
+        **samples.report(),
     }

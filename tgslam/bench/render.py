@@ -63,15 +63,14 @@ def run(
 ) -> dict[str, Any]:
     """Measure every scene on its own. threads: that the kernels run on, for the peak. step: told of each scene.
 
-    Scenes are made one at a time, when their turn comes.
+    Scenes are made one at a time, when their turn comes. The peak is measured with each of them, and the most counts.
     """
-    peak_gflops = multiply_add_gflops(threads)
-    cases = []
+    peak_gflops, cases = 0.0, []
     for make in case_scenes:
         scene = make()
         step(f"{scene.name} {scene.camera.width}x{scene.camera.height}, {len(scene.gaussians):,} Gaussians")
         cases.append(measured_together([scene], repeats)[0])
-    peak_gflops = max(peak_gflops, multiply_add_gflops(threads))
+        peak_gflops = max(peak_gflops, multiply_add_gflops(threads))
     for case in cases:
         _compare_with_peak(case, peak_gflops)
     return {"threads": threads, "peak_gflops": peak_gflops, "cases": cases}

@@ -78,7 +78,7 @@ def _add_render(benchmarks: Any) -> argparse.ArgumentParser:
         f"{' '.join(map(str, _COUNTS))})",
     )  # fmt: skip
     _add_frame_options(parser)
-    _add_repeats(parser, 10)
+    _add_repeats(parser, 20)
     parser.add_argument(
         "--threads", type=_positive, nargs="+", metavar="N",
         help="CPU threads; several take turns, in a process each (default: 1, and all cores)",
