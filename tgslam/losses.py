@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
@@ -11,8 +12,8 @@ from tgslam import images, runtime
 from tgslam.arrays import require
 from tgslam.config.schema import LossConfig
 from tgslam.kernels.objective import BIAS, DEPTHS, GAIN, GEO, GRAD, INNER, L1, PIXELS, SSIM
-from tgslam.objective import cpu
-from tgslam.objective.images import LossImages
+from tgslam.objective import cpu, cuda
+from tgslam.objective.images import LossImages, PreparedObservation
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Observation:
 
     size: tuple[int, int]  # height and width in pixels
     gate: np.ndarray  # [H, W] T of Eq. 11
-    prepared: cpu.CpuObservation  # in the form of the device's kernels
+    prepared: PreparedObservation
 
 
 @dataclass(frozen=True)
@@ -104,12 +105,31 @@ class LossResult:
         return [float(total) for total in runtime.to_host(self.images.totals)]
 
 
+class _Passes(Protocol):
+    """The kernels for images of one size on one device, with their scratch memory; arguments have been checked."""
+
+    def evaluate(
+        self,
+        colour: np.ndarray,
+        depth: np.ndarray,
+        opacity: np.ndarray,
+        observation: PreparedObservation,
+        config: LossConfig,
+        gain: float,
+        bias: float,
+        min_opacity: float,
+    ) -> LossImages:
+        """See `rgbd_loss`."""
+        ...
+
+
 class Workspace:
     """Scratch and output arrays for one image size; pass it on to save their allocation in a loop."""
 
     def __init__(self, height: int, width: int) -> None:
         self.size = (height, width)
-        self.passes = cpu.CpuObjective(height, width)
+        on_cuda = runtime.device() is runtime.Device.CUDA
+        self.passes: _Passes = (cuda.CudaObjective if on_cuda else cpu.CpuObjective)(height, width)
 
 
 def observe(
@@ -130,7 +150,8 @@ def observe(
         mask.fill(1.0)
     require("mask", mask, (height, width))
     gate = images.texture_gate(images.luminance(colour), config.gate_percentile, config.gate_noise_floor)
-    return Observation((height, width), gate, cpu.observe(colour, depth_m, mask, gate))
+    prepare = cuda.observe if runtime.device() is runtime.Device.CUDA else cpu.observe
+    return Observation((height, width), gate, prepare(colour, depth_m, mask, gate))
 
 
 def rgbd_loss(

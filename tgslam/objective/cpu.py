@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from tgslam import runtime
@@ -11,29 +9,19 @@ from tgslam.config.schema import LossConfig
 from tgslam.kernels import loss as kernels
 from tgslam.kernels.objective import STRUCTURE, TOTALS
 from tgslam.kernels.simd import LANES
-from tgslam.objective.images import LossImages
+from tgslam.objective.images import LossImages, PreparedObservation
 
 _ALIGNMENT = 64  # bytes, see `runtime.empty`
 
 
-@dataclass(frozen=True)
-class CpuObservation:
-    """A keyframe's side, as lanes: B = ceil(W / 16) blocks a row."""
+def observe(colour: np.ndarray, depth: np.ndarray, mask: np.ndarray, gate: np.ndarray) -> PreparedObservation:
+    """Prepare an observation from images [H, W, 3] and [H, W], as rows of B = ceil(W / 16) blocks of lanes.
 
-    colour: np.ndarray  # [H, 3 B, 16] interleaved RGB
-    depth: np.ndarray  # [H, B, 16] m
-    mask: np.ndarray  # [H, B, 16]
-    gate: np.ndarray  # [H, B, 16] T of Eq. 11
-    luma: np.ndarray  # [H, B, 16]
-    texture: np.ndarray  # [H, B, 16] 1 - T, 0 in the border
-    statistics: np.ndarray  # [H, B, 2, 16] windowed mean and variance of luma
-
-
-def observe(colour: np.ndarray, depth: np.ndarray, mask: np.ndarray, gate: np.ndarray) -> CpuObservation:
-    """Prepare an observation; arguments as in `CpuObservation`, but [H, W, 3] and [H, W]."""
+    Colour is [H, 3 B, 16] with interleaved channels, statistics are [H, B, 2, 16], the rest is [H, B, 16].
+    """
     height, width = depth.shape
     blocks = _blocks(width)
-    result = CpuObservation(
+    result = PreparedObservation(
         colour=in_lanes(colour),
         depth=in_lanes(depth),
         mask=in_lanes(mask),
@@ -72,7 +60,7 @@ class CpuObjective:
         colour: np.ndarray,
         depth: np.ndarray,
         opacity: np.ndarray,
-        observation: CpuObservation,
+        observation: PreparedObservation,
         config: LossConfig,
         gain: float,
         bias: float,

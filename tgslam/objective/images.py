@@ -1,10 +1,23 @@
-"""What the objective's passes give on any device."""
+"""What the objective's passes take and give."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+
+
+@dataclass(frozen=True)
+class PreparedObservation:
+    """A keyframe's side as device arrays, in the layout that the device's passes read."""
+
+    colour: np.ndarray  # RGB
+    depth: np.ndarray  # m, 0 = none
+    mask: np.ndarray  # M_rgb in [0, 1]
+    gate: np.ndarray  # T of Eq. 11
+    luma: np.ndarray
+    texture: np.ndarray  # 1 - T, 0 in the border of 5 px
+    statistics: np.ndarray  # mean and variance of luma in the SSIM window
 
 
 @dataclass(frozen=True)
