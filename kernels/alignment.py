@@ -2,24 +2,34 @@
 
 The unknowns are a left perturbation of T_ml (live camera to model camera). Model and live images share one camera.
 Moments of the matched intensities come along, from which the exposure follows in closed form.
-Every partial sum has one writer, so the sums repeat bit for bit.
+
+Every residual's Jacobian has the form (x cross a, a), x the point in the model camera's frame: a is the surface's
+normal for depth, and the image gradient carried back through the projection for colour. So a pixel's part of the
+normal matrix follows from the 3x3 matrix B = sum of w a a^T and the vector c = sum of w e a over its residuals:
+
+    J^T W J = ([x] B [x]^T, [x] B; B [x]^T, B),   J^T W e = (x cross c, c).
+
+The mathematics is written once, for a pixel (`kernels.cuda.alignment`) and for 16 of them as `Lanes` (here) alike: no
+branches, pixels that take no part have weight 0.
 """
 
 import taichi as ti
 
-from tgslam.kernels.image import F1, F2, F3
+from tgslam.kernels.simd import LANES, Lanes, lane_max, lanes_kernel, sums_of_16
 
 UNKNOWNS = 6  # rotation 3, translation 3
 TRIANGLE = UNKNOWNS * (UNKNOWNS + 1) // 2
-SPLIT = 8  # segments of columns a row: loops of up to 512 iterations would run on one thread
+ROWS = 4  # image rows that share a row of sums
 
-# Columns of a row of partial sums: upper triangle of J^T W J, J^T W r, then the statistics
+# Columns of a row of sums: upper triangle of J^T W J, J^T W r, then the statistics
 RHS = TRIANGLE
 CANDIDATES, MATCHED, INLIERS, DEPTH_SUM, COLOUR_SUM = (RHS + UNKNOWNS + k for k in range(5))
 W, W_L, W_M, W_LL, W_LM = (COLOUR_SUM + 1 + k for k in range(5))  # moments of live (L) and model (M) intensity
-PARTIAL = W_LM + 1
+LIVE_PIXELS = W_LM + 1  # with depth
+SUMS = LIVE_PIXELS + 1
+PACKED_SUMS = -(-SUMS // LANES)  # vectors that hold a row of sums
 
-# Entries of the settings array
+# Entries of the settings array; the last 12 are T_ml's rows [R | t]
 (
     FX,
     FY,
@@ -36,15 +46,34 @@ PARTIAL = W_LM + 1
     WEIGHT_DEPTH,
     WEIGHT_COLOUR,
     WEIGHT_GRADIENT,
-) = range(15)
-SETTINGS = 15
+    GATE_LOW,  # G_min of Eq. 11, 1/px
+    GATE_INVERSE_RANGE,  # 1 / (G_max - G_min + epsilon)
+    POSE,
+) = range(18)
+SETTINGS = POSE + 12
+
+# What a live pixel holds: m, intensity, its gradient and that one's length (G of Eq. 10) in 1/px
+LIVE_DEPTH, LIVE_GREY, LIVE_GX, LIVE_GY, LIVE_STRENGTH = range(5)
+LIVE = 5
+# What a model pixel holds: its surface (a normal in the model camera's frame, 0 = none, then the depth in m), and its
+# intensity with the first and second derivatives by the pixel
+MODEL_DEPTH = 3
+SURFACE = 4
+GREY, GX, GY, GXX, GXY, GYY = range(6)
+TEXTURE = 8
 
 _INLIER_SIGMAS = 3.0
 _MIN_COSINE = 0.2  # grazing rays: the noise across the surface is taken to be no less than this share of that along z
 _NEAR_M = 0.05
+MIN_DEPTH_M = 1e-3  # keeps what does not count finite
+_PART_STEP = 128  # a loop over parts counts in steps of this, since Taichi hands a thread 512 iterations at a time
 
-vec3 = ti.types.vector(3, ti.f32)
-vec6 = ti.types.vector(UNKNOWNS, ti.f32)
+SMALLEST = 4  # px, a side of an image in which any point can be looked up
+
+nd = ti.types.ndarray
+F1 = nd(dtype=ti.f32, ndim=1)
+Surface = ti.types.vector(SURFACE, ti.f32)
+Texture = ti.types.vector(TEXTURE, ti.f32)
 
 
 def triangle(a, b):
@@ -52,131 +81,293 @@ def triangle(a, b):
     return a * UNKNOWNS - a * (a - 1) // 2 + b - a
 
 
+def parts(height):
+    """Rows of sums for an image of that height."""
+    return -(-height // ROWS)
+
+
 @ti.func
-def bilinear(image: ti.template(), u, v):
-    """Value of a [H, W] image at (u, v), both inside [0, size - 1)."""
-    x, y = ti.cast(u, ti.i32), ti.cast(v, ti.i32)
-    fx, fy = u - x, v - y
-    top = image[y, x] + fx * (image[y, x + 1] - image[y, x])
-    bottom = image[y + 1, x] + fx * (image[y + 1, x + 1] - image[y + 1, x])
+def filled(like, value):
+    """`value` in the form of `like`, a scalar or Lanes."""
+    return like - like + value
+
+
+@ti.func
+def indicator(a, b):
+    """1 where a < b, else 0."""
+    return ti.select(a < b, filled(a, 1.0), filled(a, 0.0))
+
+
+@ti.func
+def magnitude(x):
+    """|x|."""
+    return ti.max(x, 0.0 - x)
+
+
+@ti.func
+def irls_weight(squared):
+    """Weight of the Charbonnier penalty rho(x) = sqrt(x^2 + 1) in reweighted least squares: rho'(x) / x."""
+    return 1.0 / ti.sqrt(1.0 + squared)
+
+
+@ti.func
+def reprojected(settings: ti.template(), u, v, depth):
+    """The live pixel's ray (x, y) at depth 1, and its point (x, y, z) in the model camera's frame, m."""
+    ray_x, ray_y = (u - settings[CX]) * (1.0 / settings[FX]), (v - settings[CY]) * (1.0 / settings[FY])
+    x = depth * (settings[POSE] * ray_x + settings[POSE + 1] * ray_y + settings[POSE + 2]) + settings[POSE + 3]
+    y = depth * (settings[POSE + 4] * ray_x + settings[POSE + 5] * ray_y + settings[POSE + 6]) + settings[POSE + 7]
+    z = depth * (settings[POSE + 8] * ray_x + settings[POSE + 9] * ray_y + settings[POSE + 10]) + settings[POSE + 11]
+    return ray_x, ray_y, x, y, z
+
+
+@ti.func
+def add(sums: ti.template(), row, column: ti.template(), value):
+    """Add to one entry. `+=` would be atomic."""
+    sums[row, column] = sums[row, column] + value
+
+
+@ti.func
+def add_symmetric(sums: ti.template(), row, x, y, z, c00, c01, c02, c10, c11, c12, c20, c21, c22):
+    """Add the rotations' block [x] B [x]^T, given C = [x] B and the point."""
+    add(sums, row, ti.static(triangle(0, 0)), c02 * y - c01 * z)
+    add(sums, row, ti.static(triangle(0, 1)), c00 * z - c02 * x)
+    add(sums, row, ti.static(triangle(0, 2)), c01 * x - c00 * y)
+    add(sums, row, ti.static(triangle(1, 1)), c10 * z - c12 * x)
+    add(sums, row, ti.static(triangle(1, 2)), c11 * x - c10 * y)
+    add(sums, row, ti.static(triangle(2, 2)), c21 * x - c20 * y)
+
+
+@ti.func
+def add_products(sums: ti.template(), row, x, y, z, b00, b01, b02, b11, b12, b22, c0, c1, c2):
+    """Add J^T W J and J^T W e of residuals of direction moments B (b) and c at the point (x, y, z)."""
+    add(sums, row, ti.static(triangle(3, 3)), b00)
+    add(sums, row, ti.static(triangle(3, 4)), b01)
+    add(sums, row, ti.static(triangle(3, 5)), b02)
+    add(sums, row, ti.static(triangle(4, 4)), b11)
+    add(sums, row, ti.static(triangle(4, 5)), b12)
+    add(sums, row, ti.static(triangle(5, 5)), b22)
+    # C = [x] B, rotation by translation
+    c00, c01, c02 = y * b02 - z * b01, y * b12 - z * b11, y * b22 - z * b12
+    c10, c11, c12 = z * b00 - x * b02, z * b01 - x * b12, z * b02 - x * b22
+    c20, c21, c22 = x * b01 - y * b00, x * b11 - y * b01, x * b12 - y * b02
+    add(sums, row, ti.static(triangle(0, 3)), c00)
+    add(sums, row, ti.static(triangle(0, 4)), c01)
+    add(sums, row, ti.static(triangle(0, 5)), c02)
+    add(sums, row, ti.static(triangle(1, 3)), c10)
+    add(sums, row, ti.static(triangle(1, 4)), c11)
+    add(sums, row, ti.static(triangle(1, 5)), c12)
+    add(sums, row, ti.static(triangle(2, 3)), c20)
+    add(sums, row, ti.static(triangle(2, 4)), c21)
+    add(sums, row, ti.static(triangle(2, 5)), c22)
+    add_symmetric(sums, row, x, y, z, c00, c01, c02, c10, c11, c12, c20, c21, c22)
+    add(sums, row, RHS + 0, y * c2 - z * c1)
+    add(sums, row, RHS + 1, z * c0 - x * c2)
+    add(sums, row, RHS + 2, x * c1 - y * c0)
+    add(sums, row, RHS + 3, c0)
+    add(sums, row, RHS + 4, c1)
+    add(sums, row, RHS + 5, c2)
+
+
+@ti.func
+def gate_at(settings: ti.template(), strength):
+    """T of Eq. 11 for a gradient of that length: 1 = no texture."""
+    return 1.0 - ti.min(ti.max((strength - settings[GATE_LOW]) * settings[GATE_INVERSE_RANGE], 0.0), 1.0)
+
+
+@ti.func
+def add_residuals(
+    settings: ti.template(),
+    ray_x,  # of the live pixel
+    ray_y,
+    depth,
+    live,
+    live_gx,
+    live_gy,
+    strength,
+    x,  # its point in the model camera's frame
+    y,
+    z,
+    seen,  # 1 where that falls into the model image
+    nx,  # the model's surface at the nearest pixel
+    ny,
+    nz,
+    model_depth,
+    near_u,  # that pixel
+    near_v,
+    model,  # the model's image at the point
+    gx,
+    gy,
+    gxx,
+    gxy,
+    gyy,
+    sums: ti.template(),
+    row,
+):
+    """Add what live pixels say of Eqs. 12, 13 to a row of sums."""
+    gate = gate_at(settings, strength)
+    candidate = seen * indicator(filled(z, 0.0), model_depth)
+    # depth: e is the length of the residual, whose sign is the distance's
+    sigma = settings[DEPTH_SIGMA] * depth * depth
+    has_normal = indicator(filled(z, 0.5), nx * nx + ny * ny + nz * nz)
+    length = ti.sqrt(ray_x * ray_x + ray_y * ray_y + 1.0)
+    cosine = ti.max((0.0 - (nx * ray_x + ny * ray_y + nz)) / length, _MIN_COSINE)
+    model_x = model_depth * ((near_u - settings[CX]) * (1.0 / settings[FX]))
+    model_y = model_depth * ((near_v - settings[CY]) * (1.0 / settings[FY]))
+    distance = nx * (x - model_x) + ny * (y - model_y) + nz * (z - model_depth)
+    across = magnitude(distance) / cosine
+    along = has_normal * across + (1.0 - has_normal) * magnitude(z - model_depth)
+    matched = candidate * indicator(along, settings[MAX_DISTANCE_SIGMAS] * sigma)
+    on_surface = matched * has_normal
+    inv_sigma = 1.0 / (sigma * cosine)
+    e = magnitude(distance) * inv_sigma
+    scaled = e * (1.0 / settings[CHARBONNIER_DEPTH])
+    weight = settings[WEIGHT_DEPTH] * on_surface * (1.0 + settings[GATE_DEPTH_BOOST] * gate)
+    weight *= irls_weight(scaled * scaled) * inv_sigma * inv_sigma
+    weight_x, weight_y, weight_z, weight_e = weight * nx, weight * ny, weight * nz, weight * distance
+    # intensity
+    inv_colour = 1.0 / settings[SIGMA_COLOUR]
+    e_colour = inv_colour * (model - settings[GAIN] * live - settings[BIAS])
+    robust = matched * irls_weight(e_colour * e_colour)
+    w_colour = robust * (settings[WEIGHT_COLOUR] * inv_colour)
+    # its gradient, where there is texture
+    inv_gradient = 1.0 / settings[SIGMA_GRADIENT]
+    ex = inv_gradient * (gx - settings[GAIN] * live_gx)
+    ey = inv_gradient * (gy - settings[GAIN] * live_gy)
+    w_gradient = matched * (1.0 - gate) * irls_weight(ex * ex + ey * ey)
+    w_gradient *= settings[WEIGHT_GRADIENT] * inv_gradient
+    # sums of w j j^T and w e j over both, j the derivative by the position in the model's image, then by the point
+    inv_z = 1.0 / ti.max(z, _NEAR_M)
+    sx, sy = settings[FX] * inv_z, settings[FY] * inv_z
+    p0 = sx * (w_colour * e_colour * gx + w_gradient * (ex * gxx + ey * gxy))
+    p1 = sy * (w_colour * e_colour * gy + w_gradient * (ex * gxy + ey * gyy))
+    w_colour *= inv_colour
+    w_gradient *= inv_gradient
+    p00 = sx * sx * (w_colour * gx * gx + w_gradient * (gxx * gxx + gxy * gxy))
+    p01 = sx * sy * (w_colour * gx * gy + w_gradient * gxy * (gxx + gyy))
+    p11 = sy * sy * (w_colour * gy * gy + w_gradient * (gxy * gxy + gyy * gyy))
+    tx, ty = x * inv_z, y * inv_z
+    p2, p02, p12 = 0.0 - (p0 * tx + p1 * ty), 0.0 - (p00 * tx + p01 * ty), 0.0 - (p01 * tx + p11 * ty)
+    p22 = 0.0 - (p02 * tx + p12 * ty)
+    add_products(
+        sums, row, x, y, z,
+        weight_x * nx + p00, weight_x * ny + p01, weight_x * nz + p02,
+        weight_y * ny + p11, weight_y * nz + p12, weight_z * nz + p22,
+        weight_e * nx + p0, weight_e * ny + p1, weight_e * nz + p2,
+    )  # fmt: skip
+    add(sums, row, CANDIDATES, candidate)
+    add(sums, row, MATCHED, matched)
+    add(sums, row, INLIERS, on_surface * indicator(e, filled(e, _INLIER_SIGMAS)))
+    add(sums, row, DEPTH_SUM, on_surface * e)
+    add(sums, row, COLOUR_SUM, matched * magnitude(e_colour))
+    add(sums, row, W, robust)
+    add(sums, row, W_L, robust * live)
+    add(sums, row, W_M, robust * model)
+    add(sums, row, W_LL, robust * live * live)
+    add(sums, row, W_LM, robust * live * model)
+
+
+@ti.func
+def in_model_image(settings: ti.template(), x, y, z, width, height):
+    """Where a point falls in the model's image, held inside [1, size - 2], and 1 if it was there without that.
+
+    Returns u, v, px, and the indicator.
+    """
+    inv_z = 1.0 / ti.max(z, _NEAR_M)
+    u, v = settings[FX] * x * inv_z + settings[CX], settings[FY] * y * inv_z + settings[CY]
+    seen = indicator(filled(z, _NEAR_M), z)
+    seen *= 1.0 - ti.max(indicator(u, filled(u, 1.0)), indicator(v, filled(v, 1.0)))
+    seen *= indicator(u, filled(u, width - 2.0)) * indicator(v, filled(v, height - 2.0))
+    return ti.min(ti.max(u, 1.0), width - 2.0), ti.min(ti.max(v, 1.0), height - 2.0), seen
+
+
+@ti.func
+def bilinear(texture: ti.template(), x, y, fx, fy):
+    """All values of the texture at (x + fx, y + fy)."""
+    a, b, c, d = texture[y, x], texture[y, x + 1], texture[y + 1, x], texture[y + 1, x + 1]
+    top = a + fx * (b - a)
+    bottom = c + fx * (d - c)
     return top + fy * (bottom - top)
 
 
 @ti.func
-def irls_weight(normalised):
-    """Weight of the Charbonnier penalty rho(x) = sqrt(x^2 + 1) in reweighted least squares: rho'(x) / x."""
-    return 1.0 / ti.sqrt(1.0 + normalised * normalised)
+def add_16_pixels(
+    settings: ti.template(),
+    v,
+    block,
+    live: ti.template(),
+    surface: ti.template(),
+    texture: ti.template(),
+    sums: ti.template(),
+    row,
+):
+    """Add what a block of a row's live pixels says. Only the look-ups in the model go lane by lane."""
+    height, width = surface.shape[0], surface.shape[1]
+    depth = live[v, block, LIVE_DEPTH]
+    u = Lanes([float(j) for j in range(LANES)]) + ti.cast(block * LANES, ti.f32)
+    ray_x, ray_y, x, y, z = reprojected(settings, u, filled(u, ti.cast(v, ti.f32)), depth)
+    um, vm, seen = in_model_image(settings, x, y, z, width, height)
+    seen *= indicator(filled(z, 0.0), depth)
+    nx, ny, nz, model_depth, near_u, near_v = Lanes(0.0), Lanes(0.0), Lanes(0.0), Lanes(0.0), Lanes(0.0), Lanes(0.0)
+    grey, gx, gy, gxx, gxy, gyy = Lanes(0.0), Lanes(0.0), Lanes(0.0), Lanes(0.0), Lanes(0.0), Lanes(0.0)
+    for j in ti.static(range(LANES)):
+        u_near, v_near = ti.cast(um[j] + 0.5, ti.i32), ti.cast(vm[j] + 0.5, ti.i32)
+        near_u[j], near_v[j] = ti.cast(u_near, ti.f32), ti.cast(v_near, ti.f32)
+        s = surface[v_near, u_near]
+        nx[j], ny[j], nz[j], model_depth[j] = s[0], s[1], s[2], s[MODEL_DEPTH]
+        u_cell, v_cell = ti.cast(um[j], ti.i32), ti.cast(vm[j], ti.i32)
+        t = bilinear(texture, u_cell, v_cell, um[j] - ti.cast(u_cell, ti.f32), vm[j] - ti.cast(v_cell, ti.f32))
+        grey[j], gx[j], gy[j], gxx[j], gxy[j], gyy[j] = t[GREY], t[GX], t[GY], t[GXX], t[GXY], t[GYY]
+    add_residuals(
+        settings, ray_x, ray_y, ti.max(depth, MIN_DEPTH_M),
+        live[v, block, LIVE_GREY], live[v, block, LIVE_GX], live[v, block, LIVE_GY], live[v, block, LIVE_STRENGTH],
+        x, y, z, seen, nx, ny, nz, model_depth, near_u, near_v,
+        grey, gx, gy, gxx, gxy, gyy, sums, row,
+    )  # fmt: skip
+    add(sums, row, LIVE_PIXELS, indicator(filled(z, 0.0), depth))
 
 
 @ti.func
-def motion_jacobian(x, direction):
-    """d (direction . x) / d xi for a left perturbation of the transform that gave x: (x cross direction, direction)."""
-    turn = x.cross(direction)
-    return vec6([turn[0], turn[1], turn[2], direction[0], direction[1], direction[2]])
+def entry(sums: ti.template(), row, column: ti.template()):
+    """A vector of a row of sums, 0 beyond the last."""
+    result = Lanes(0.0)
+    if ti.static(column < SUMS):
+        result = sums[row, column]
+    return result
 
 
 @ti.func
-def image_jacobian(gx, gy, fx, fy, x, inv_z):
-    """d image(project(x)) / d xi for an image gradient (gx, gy) in 1/px."""
-    dx, dy = gx * fx * inv_z, gy * fy * inv_z
-    return motion_jacobian(x, vec3([dx, dy, -(dx * x[0] + dy * x[1]) * inv_z]))
+def lane_sums(sums: ti.template(), row, k: ti.template()):
+    """Lane j: the sum of the lanes of entry k + j of a row."""
+    return sums_of_16(
+        entry(sums, row, k), entry(sums, row, k + 1), entry(sums, row, k + 2), entry(sums, row, k + 3),
+        entry(sums, row, k + 4), entry(sums, row, k + 5), entry(sums, row, k + 6), entry(sums, row, k + 7),
+        entry(sums, row, k + 8), entry(sums, row, k + 9), entry(sums, row, k + 10), entry(sums, row, k + 11),
+        entry(sums, row, k + 12), entry(sums, row, k + 13), entry(sums, row, k + 14), entry(sums, row, k + 15),
+    )  # fmt: skip
 
 
-@ti.kernel
+@lanes_kernel
 def normal_equations(
     settings: F1,  # [SETTINGS]
-    T_ml: F1,  # [12] live camera to model camera
-    live_depth: F2,  # [H, W] m
-    live_grey: F2,  # [H, W]
-    live_gx: F2,  # [H, W] 1/px
-    live_gy: F2,  # [H, W]
-    gate: F2,  # [H, W] T of Eq. 11: 1 = no texture
-    model_depth: F2,  # [H, W] m
-    model_normal: F3,  # [H, W, 3] model camera frame, 0 = none
-    model_grey: F2,  # [H, W]
-    model_gx: F2,  # [H, W]
-    model_gy: F2,  # [H, W]
-    model_gxx: F2,  # [H, W] derivatives of the gradient images
-    model_gxy: F2,  # [H, W]
-    model_gyy: F2,  # [H, W]
-    partial: F2,  # [H * SPLIT, PARTIAL] out
+    live: nd(Lanes, ndim=3),  # [H, B, LIVE], B = ceil(W / 16)
+    surface: nd(Surface, ndim=2),  # [H, W]
+    texture: nd(Texture, ndim=2),  # [H, W]
+    sums: nd(Lanes, ndim=2),  # [parts(H), SUMS] scratch
+    packed: nd(Lanes, ndim=2),  # [parts(H), PACKED_SUMS] out: the sums of a part side by side, then zeros
 ):
-    """Sum the weighted normal equations of Eqs. 12, 13 over the live pixels, a row of sums for a segment of pixels.
+    """Sum the weighted normal equations of Eqs. 12, 13 over the live pixels, a row of sums for each part of the image.
 
     SSIM (Eq. 12's third term) is no sum of squares and is left to the first-order solver.
     """
-    for part in range(partial.shape[0]):
-        height, width = live_depth.shape[0], live_depth.shape[1]
-        v = part // SPLIT
-        begin, end = (part - v * SPLIT) * width // SPLIT, (part - v * SPLIT + 1) * width // SPLIT
-        fx, fy, cx, cy = settings[FX], settings[FY], settings[CX], settings[CY]
-        sums = ti.Vector([0.0] * PARTIAL)
-        for u in range(begin, end):
-            z = live_depth[v, u]
-            if z > 0.0:
-                ray = vec3([(u - cx) / fx * z, (v - cy) / fy * z, z])
-                x = vec3([T_ml[3], T_ml[7], T_ml[11]])
-                for r in ti.static(range(3)):
-                    for c in ti.static(range(3)):
-                        x[r] += T_ml[4 * r + c] * ray[c]
-                inv_z = 1.0 / ti.max(x[2], _NEAR_M)
-                um, vm = fx * x[0] * inv_z + cx, fy * x[1] * inv_z + cy
-                if x[2] > _NEAR_M and um >= 1.0 and vm >= 1.0 and um < width - 2.0 and vm < height - 2.0:
-                    un, vn = ti.cast(um + 0.5, ti.i32), ti.cast(vm + 0.5, ti.i32)
-                    zm = model_depth[vn, un]
-                    if zm > 0.0:
-                        sums[CANDIDATES] += 1.0
-                        sigma_z = settings[DEPTH_SIGMA] * z * z
-                        n = vec3([model_normal[vn, un, 0], model_normal[vn, un, 1], model_normal[vn, un, 2]])
-                        has_normal = n.dot(n) > 0.5
-                        cosine = ti.max(-n.dot(ray) / ray.norm(), _MIN_COSINE)
-                        distance = n.dot(x - vec3([(un - cx) / fx * zm, (vn - cy) / fy * zm, zm]))
-                        along = ti.select(has_normal, ti.abs(distance) / cosine, ti.abs(x[2] - zm))
-                        if along < settings[MAX_DISTANCE_SIGMAS] * sigma_z:
-                            sums[MATCHED] += 1.0
-                            if has_normal:
-                                inv_sigma = 1.0 / (sigma_z * cosine)
-                                e = distance * inv_sigma
-                                w = settings[WEIGHT_DEPTH] * (1.0 + settings[GATE_DEPTH_BOOST] * gate[v, u])
-                                w *= irls_weight(e / settings[CHARBONNIER_DEPTH])
-                                sums[INLIERS] += ti.select(ti.abs(e) < _INLIER_SIGMAS, 1.0, 0.0)
-                                sums[DEPTH_SUM] += ti.abs(e)
-                                J = inv_sigma * motion_jacobian(x, n)
-                                for a in ti.static(range(UNKNOWNS)):
-                                    sums[RHS + a] += w * e * J[a]
-                                    for b in ti.static(range(a, UNKNOWNS)):
-                                        sums[ti.static(triangle(a, b))] += w * J[a] * J[b]
-                            # intensity
-                            live, model = live_grey[v, u], bilinear(model_grey, um, vm)
-                            gx, gy = bilinear(model_gx, um, vm), bilinear(model_gy, um, vm)
-                            inv_colour = 1.0 / settings[SIGMA_COLOUR]
-                            e = inv_colour * (model - settings[GAIN] * live - settings[BIAS])
-                            robust = irls_weight(e)
-                            w = settings[WEIGHT_COLOUR] * robust
-                            sums[COLOUR_SUM] += ti.abs(e)
-                            sums[W] += robust
-                            sums[W_L] += robust * live
-                            sums[W_M] += robust * model
-                            sums[W_LL] += robust * live * live
-                            sums[W_LM] += robust * live * model
-                            J = inv_colour * image_jacobian(gx, gy, fx, fy, x, inv_z)
-                            for a in ti.static(range(UNKNOWNS)):
-                                sums[RHS + a] += w * e * J[a]
-                                for b in ti.static(range(a, UNKNOWNS)):
-                                    sums[ti.static(triangle(a, b))] += w * J[a] * J[b]
-                            # gradient, where there is texture
-                            texture = 1.0 - gate[v, u]
-                            if settings[WEIGHT_GRADIENT] * texture > 0.0:
-                                inv_gradient = 1.0 / settings[SIGMA_GRADIENT]
-                                gxy = bilinear(model_gxy, um, vm)
-                                ex = inv_gradient * (gx - settings[GAIN] * live_gx[v, u])
-                                ey = inv_gradient * (gy - settings[GAIN] * live_gy[v, u])
-                                wg = settings[WEIGHT_GRADIENT] * texture * irls_weight(ti.sqrt(ex * ex + ey * ey))
-                                Jx = image_jacobian(bilinear(model_gxx, um, vm), gxy, fx, fy, x, inv_z) * inv_gradient
-                                Jy = image_jacobian(gxy, bilinear(model_gyy, um, vm), fx, fy, x, inv_z) * inv_gradient
-                                for a in ti.static(range(UNKNOWNS)):
-                                    sums[RHS + a] += wg * (ex * Jx[a] + ey * Jy[a])
-                                    for b in ti.static(range(a, UNKNOWNS)):
-                                        sums[ti.static(triangle(a, b))] += wg * (Jx[a] * Jx[b] + Jy[a] * Jy[b])
-        for c in ti.static(range(PARTIAL)):
-            partial[part, c] = sums[c]
+    for spread in range(packed.shape[0] * _PART_STEP):
+        part = spread // _PART_STEP
+        if spread - part * _PART_STEP == 0:
+            for k in ti.static(range(SUMS)):
+                sums[part, k] = Lanes(0.0)
+            if surface.shape[0] >= SMALLEST and surface.shape[1] >= SMALLEST:
+                for v in range(part * ROWS, ti.min(part * ROWS + ROWS, surface.shape[0])):
+                    for block in range(live.shape[1]):
+                        if lane_max(live[v, block, LIVE_DEPTH]) > 0.0:
+                            add_16_pixels(settings, v, block, live, surface, texture, sums, part)
+            for k in ti.static(range(PACKED_SUMS)):
+                packed[part, k] = lane_sums(sums, part, k * LANES)

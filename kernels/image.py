@@ -1,4 +1,4 @@
-"""Image kernels: luminance, 2x2 halving, Sobel gradients, the texture gate and normals from depth. CPU form.
+"""Image kernels: luminance, 2x2 halving, Sobel gradients, the texture gate, normals from depth, records for alignment.
 
 A parallel loop of up to 512 iterations runs on one thread, so each row is cut into SPLIT segments of columns.
 Every output has one writer.
@@ -6,11 +6,29 @@ Every output has one writer.
 
 import taichi as ti
 
+from tgslam.kernels.alignment import (
+    GREY,
+    GX,
+    GXX,
+    GXY,
+    GY,
+    GYY,
+    LIVE_DEPTH,
+    LIVE_GREY,
+    LIVE_GX,
+    LIVE_GY,
+    LIVE_STRENGTH,
+    MODEL_DEPTH,
+)
+from tgslam.kernels.simd import LANES
+
 SPLIT = 4  # segments of columns a row: 480 rows give 1920 parallel iterations
+FAR_M = 1e3  # depth beyond is no measurement: what takes no part in alignment must be finite all the same
 
 F1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
 F2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
 F3 = ti.types.ndarray(dtype=ti.f32, ndim=3)
+F4 = ti.types.ndarray(dtype=ti.f32, ndim=4)
 
 
 @ti.func
@@ -19,6 +37,44 @@ def segment(index, columns):
     row = index // SPLIT
     part = index - row * SPLIT
     return row, part * columns // SPLIT, (part + 1) * columns // SPLIT
+
+
+@ti.func
+def luma(colour: ti.template(), i, j):
+    """Luma of a pixel, 0.299 R + 0.587 G + 0.114 B."""
+    return 0.299 * colour[i, j, 0] + 0.587 * colour[i, j, 1] + 0.114 * colour[i, j, 2]
+
+
+@ti.func
+def mean_luma(colour: ti.template(), i, j, size: ti.template()):
+    """Mean luma of the block (i, j) of size x size pixels."""
+    total = 0.0
+    for k in ti.static(range(size * size)):
+        total += luma(colour, size * i + k // size, size * j + k % size)
+    return total * (1.0 / (size * size))
+
+
+@ti.func
+def mean_of_nearest(z, relative):
+    """Mean of those measurements of a vector (m, 0 = none) that lie on its nearest surface; 0 where it has none."""
+    nearest = 1e30
+    for k in ti.static(range(z.n)):
+        nearest = ti.min(nearest, ti.select(z[k] > 0.0, z[k], 1e30))
+    total, count = 0.0, 0.0
+    for k in ti.static(range(z.n)):
+        keep = ti.select((z[k] > 0.0) and (z[k] <= nearest * (1.0 + relative)), 1.0, 0.0)
+        total += keep * z[k]
+        count += keep
+    return total / ti.max(count, 1.0)
+
+
+@ti.func
+def depth_block(depth: ti.template(), i, j, size: ti.template()):
+    """The measurements of the block (i, j) of size x size pixels as a vector."""
+    z = ti.Vector([0.0] * (size * size))
+    for k in ti.static(range(size * size)):
+        z[k] = depth[size * i + k // size, size * j + k % size]
+    return z
 
 
 @ti.kernel
@@ -30,7 +86,69 @@ def luminance(
     for s in range(colour.shape[0] * SPLIT):
         i, begin, end = segment(s, colour.shape[1])
         for j in range(begin, end):
-            grey[i, j] = 0.299 * colour[i, j, 0] + 0.587 * colour[i, j, 1] + 0.114 * colour[i, j, 2]
+            grey[i, j] = luma(colour, i, j)
+
+
+@ti.kernel
+def reduce_frame(
+    colour: F3,  # [H, W, 3] RGB
+    depth: F2,  # [H, W] m, 0 = none
+    size: ti.template(),  # 1 or 2: pixels that become one, either way
+    relative: ti.f32,
+    grey: F2,  # [H // size, W // size] out
+    reduced: F2,  # [H // size, W // size] m, out
+):
+    """Luminance and depth of a frame, as it is or halved."""
+    for s in range(grey.shape[0] * SPLIT):
+        i, begin, end = segment(s, grey.shape[1])
+        for j in range(begin, end):
+            grey[i, j] = mean_luma(colour, i, j, size)
+            reduced[i, j] = mean_of_nearest(depth_block(depth, i, j, size), relative)
+
+
+@ti.kernel
+def reduce_rendering(
+    colour: F3,  # [H, W, 3] RGB
+    depth: F2,  # [H, W] m, accumulated
+    opacity: F2,  # [H, W]
+    min_opacity: ti.f32,  # pixels of less have no depth
+    size: ti.template(),  # 1 or 2: pixels that become one, either way
+    relative: ti.f32,
+    grey: F2,  # [H // size, W // size] out
+    reduced: F2,  # [H // size, W // size] m, out
+):
+    """Luminance and depth of a rendering, as it is or halved. Colours are fitted over black, and are not divided."""
+    for s in range(grey.shape[0] * SPLIT):
+        i, begin, end = segment(s, grey.shape[1])
+        for j in range(begin, end):
+            grey[i, j] = mean_luma(colour, i, j, size)
+            z, covered = depth_block(depth, i, j, size), depth_block(opacity, i, j, size)
+            for k in ti.static(range(z.n)):
+                z[k] = ti.select(covered[k] > min_opacity, z[k] / ti.max(covered[k], min_opacity), 0.0)
+            reduced[i, j] = mean_of_nearest(z, relative)
+
+
+@ti.kernel
+def halve_pair(
+    grey: F2,  # [H, W]
+    depth: F2,  # [H, W] m, 0 = none
+    relative: ti.f32,
+    half_grey: F2,  # [H // 2, W // 2] out
+    half_depth: F2,  # [H // 2, W // 2] m, out
+):
+    """`halve_grey` and `halve_depth` in one pass."""
+    for s in range(half_grey.shape[0] * SPLIT):
+        i, begin, end = segment(s, half_grey.shape[1])
+        for j in range(begin, end):
+            half_grey[i, j] = block_mean(grey, i, j)
+            half_depth[i, j] = mean_of_nearest(depth_block(depth, i, j, 2), relative)
+
+
+@ti.func
+def block_mean(image: ti.template(), i, j):
+    """Mean of the 2x2 block (i, j)."""
+    top = image[2 * i, 2 * j] + image[2 * i, 2 * j + 1]
+    return 0.25 * (top + image[2 * i + 1, 2 * j] + image[2 * i + 1, 2 * j + 1])
 
 
 @ti.kernel
@@ -42,8 +160,7 @@ def halve_grey(
     for s in range(half.shape[0] * SPLIT):
         i, begin, end = segment(s, half.shape[1])
         for j in range(begin, end):
-            top = image[2 * i, 2 * j] + image[2 * i, 2 * j + 1]
-            half[i, j] = 0.25 * (top + image[2 * i + 1, 2 * j] + image[2 * i + 1, 2 * j + 1])
+            half[i, j] = block_mean(image, i, j)
 
 
 @ti.kernel
@@ -70,18 +187,7 @@ def halve_depth(
     for s in range(half.shape[0] * SPLIT):
         i, begin, end = segment(s, half.shape[1])
         for j in range(begin, end):
-            nearest = 1e30
-            for k in ti.static(range(4)):
-                z = depth[2 * i + k // 2, 2 * j + k % 2]
-                nearest = ti.min(nearest, ti.select(z > 0.0, z, 1e30))
-            total = 0.0
-            count = 0.0
-            for k in ti.static(range(4)):
-                z = depth[2 * i + k // 2, 2 * j + k % 2]
-                keep = ti.select((z > 0.0) and (z <= nearest * (1.0 + relative)), 1.0, 0.0)
-                total += keep * z
-                count += keep
-            half[i, j] = total / ti.max(count, 1.0)
+            half[i, j] = mean_of_nearest(depth_block(depth, i, j, 2), relative)
 
 
 @ti.func
@@ -96,18 +202,84 @@ def sobel_at(image: ti.template(), i, j):
 
 
 @ti.kernel
-def sobel(
-    image: F2,  # [H, W]
-    grad_x: F2,  # [H, W] per px, out
-    grad_y: F2,  # [H, W] per px, out
+def pack_live(
+    grey: F2,  # [H, W]
+    depth: F2,  # [H, W] m, 0 = none
+    live: F4,  # [H, B, LIVE, 16] out, B = ceil(W / 16); beyond the image there is no depth
 ):
-    """Sobel gradients divided by 8, so that a ramp of slope s gives s; edges are replicated."""
-    for s in range(image.shape[0] * SPLIT):
-        i, begin, end = segment(s, image.shape[1])
+    """What alignment needs of a live frame, in blocks of 16 pixels."""
+    height, width = grey.shape[0], grey.shape[1]
+    for s in range(height * SPLIT):
+        i, begin, end = segment(s, live.shape[1])
+        for block in range(begin, end):
+            for lane in range(LANES):
+                j = block * LANES + lane
+                inside = ti.min(j, width - 1)
+                z = depth[i, inside]
+                gx, gy = sobel_at(grey, i, inside)
+                live[i, block, LIVE_DEPTH, lane] = ti.select(j < width and z > 0.0 and z < FAR_M, z, 0.0)
+                live[i, block, LIVE_GREY, lane] = grey[i, inside]
+                live[i, block, LIVE_GX, lane] = gx
+                live[i, block, LIVE_GY, lane] = gy
+                live[i, block, LIVE_STRENGTH, lane] = ti.sqrt(gx * gx + gy * gy)
+
+
+@ti.kernel
+def sample_strength(
+    live: F4,  # [H, B, LIVE, 16]
+    step: ti.i32,  # px
+    sample: F2,  # [ceil(H / step), ceil(W / step)] out
+):
+    """Every `step`-th pixel's gradient magnitude."""
+    for i in range(sample.shape[0]):
+        for j in range(sample.shape[1]):
+            x = j * step
+            sample[i, j] = live[i * step, x // LANES, LIVE_STRENGTH, x % LANES]
+
+
+@ti.kernel
+def sample_grid(
+    image: F2,  # [H, W]
+    step: ti.i32,  # px
+    sample: F2,  # [ceil(H / step), ceil(W / step)] out
+):
+    """Every `step`-th pixel, either way."""
+    for i in range(sample.shape[0]):
+        for j in range(sample.shape[1]):
+            sample[i, j] = image[i * step, j * step]
+
+
+@ti.kernel
+def pack_texture(
+    grey: F2,  # [H, W]
+    texture: F3,  # [H, W, TEXTURE] out: all but the second derivatives
+):
+    """Intensity and its gradient as alignment reads them."""
+    for s in range(grey.shape[0] * SPLIT):
+        i, begin, end = segment(s, grey.shape[1])
         for j in range(begin, end):
-            gx, gy = sobel_at(image, i, j)
-            grad_x[i, j] = gx
-            grad_y[i, j] = gy
+            gx, gy = sobel_at(grey, i, j)
+            texture[i, j, GREY] = grey[i, j]
+            texture[i, j, GX] = gx
+            texture[i, j, GY] = gy
+
+
+@ti.kernel
+def pack_second_derivatives(
+    texture: F3,  # [H, W, TEXTURE]
+):
+    """The gradient's own gradient, from the texture's gradient."""
+    height, width = texture.shape[0], texture.shape[1]
+    for s in range(height * SPLIT):
+        i, begin, end = segment(s, width)
+        up, down = ti.max(i - 1, 0), ti.min(i + 1, height - 1)
+        for j in range(begin, end):
+            left, right = ti.max(j - 1, 0), ti.min(j + 1, width - 1)
+            a, b = texture[down, right, GX] - texture[up, left, GX], texture[down, left, GX] - texture[up, right, GX]
+            texture[i, j, GXX] = 0.125 * (a - b + 2.0 * (texture[i, right, GX] - texture[i, left, GX]))
+            texture[i, j, GXY] = 0.125 * (a + b + 2.0 * (texture[down, j, GX] - texture[up, j, GX]))
+            c, d = texture[down, right, GY] - texture[up, left, GY], texture[down, left, GY] - texture[up, right, GY]
+            texture[i, j, GYY] = 0.125 * (c + d + 2.0 * (texture[down, j, GY] - texture[up, j, GY]))
 
 
 @ti.kernel
@@ -163,7 +335,7 @@ def inverse_depth_blocks(
 
 
 @ti.func
-def fit_block(blocks: ti.template(), i, j, radius, noise, slope):
+def fit_block(blocks: ti.template(), i, j, radius: ti.template(), noise, slope):
     """Least squares w(x, y) = w0 + wx x + wy y over the like neighbours of block (i, j).
 
     Returns (w0, wx, wy, mean squared residual), x and y in blocks, w in 1/m; w0 = 0 when there is no fit.
@@ -171,23 +343,23 @@ def fit_block(blocks: ti.template(), i, j, radius, noise, slope):
     centre = blocks[i, j]
     n, sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     sw, sxw, syw, sww = 0.0, 0.0, 0.0, 0.0
-    first, last = ti.max(j - radius, 0), ti.min(j + radius, blocks.shape[1] - 1)
-    for r in range(ti.max(i - radius, 0), ti.min(i + radius, blocks.shape[0] - 1) + 1):
-        y = ti.cast(r - i, ti.f32)
+    for y in ti.static(range(-radius, radius + 1)):
+        r = ti.min(ti.max(i + y, 0), blocks.shape[0] - 1)
         row_n, row_x, row_w, row_xw = 0.0, 0.0, 0.0, 0.0
-        for c in range(first, last + 1):
-            x = ti.cast(c - j, ti.f32)
+        for x in ti.static(range(-radius, radius + 1)):
+            c = ti.min(ti.max(j + x, 0), blocks.shape[1] - 1)
             w = blocks[r, c]
-            d = w - centre
-            if w > 0.0 and ti.abs(d) <= noise + slope * centre * ti.max(ti.abs(x), ti.abs(y)):
-                row_n += 1.0
-                row_x += x
-                row_w += d
-                row_xw += d * x
-                sxx += x * x
-                sww += d * d
+            near = ti.abs(w - centre) <= noise + slope * centre * max(abs(x), abs(y))
+            like = ti.select(w > 0.0 and near and r == i + y and c == j + x, 1.0, 0.0)
+            d = like * (w - centre)
+            row_n += like
+            row_x += x * like
+            row_w += d
+            row_xw += x * d
+            sxx += (x * x) * like
+            sww += d * d
         n, sx, sy, sw = n + row_n, sx + row_x, sy + row_n * y, sw + row_w
-        sxy, syy, sxw, syw = sxy + row_x * y, syy + row_n * y * y, sxw + row_xw, syw + row_w * y
+        sxy, syy, sxw, syw = sxy + row_x * y, syy + row_n * (y * y), sxw + row_xw, syw + row_w * y
     mean = 1.0 / ti.max(n, 1.0)
     cxx, cxy, cyy = sxx - sx * sx * mean, sxy - sx * sy * mean, syy - sy * sy * mean
     cxw, cyw, cww = sxw - sx * sw * mean, syw - sy * sw * mean, sww - sw * sw * mean
@@ -209,10 +381,11 @@ def normals(
     fy: ti.f32,
     cx: ti.f32,
     cy: ti.f32,
-    radius: ti.i32,  # blocks
+    radius: ti.template(),  # blocks
     sigma: ti.f32,  # standard deviation of inverse depth, 1/m
     steepest: ti.f32,  # tangent of the largest angle between normal and optical axis that may be joined
-    out: F3,  # [H, W, 3] camera frame, towards the camera, out
+    with_depth: ti.template(),
+    out: F3,  # [H, W, 3] camera frame, towards the camera, out; with_depth: [H, W, 4], and the depth in m
 ):
     """Normals from plane fits of inverse depth, one fit a 2x2 block, given to the pixels that lie on the fit."""
     for s in range(blocks.shape[0] * SPLIT):
@@ -234,3 +407,5 @@ def normals(
                     out[r, c, 0] = nx * scale
                     out[r, c, 1] = ny * scale
                     out[r, c, 2] = nz * scale
+                    if ti.static(with_depth):
+                        out[r, c, MODEL_DEPTH] = ti.select(z > 0.0 and z < FAR_M, z, 0.0)

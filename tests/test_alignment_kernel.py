@@ -13,8 +13,7 @@ from tgslam.kernels import alignment
 
 T_ML = se3_exp([0.02, -0.03, 0.015, 0.02, -0.015, 0.03])
 SIZES = [(24, 32), (23, 37), (4, 5), (9, 1), (1, 9)]
-LIVE = ("depth", "grey", "gx", "gy", "gate")
-MODEL = ("depth", "normal", "grey", "gx", "gy", "gxx", "gxy", "gyy")
+TEXTURE = ("grey", "gx", "gy", "gxx", "gxy", "gyy")
 
 
 def settings_for(height, width, **changes):
@@ -53,15 +52,44 @@ def image_pair(height, width, seed=0, holes=0.15):
     return rounded(live), rounded(model)
 
 
+def in_blocks(images):
+    """Images [H, W] as the kernel reads a live frame, [H, B, LIVE, 16]; lanes beyond the image hold no depth."""
+    height, width = images[0].shape
+    blocks = -(-width // alignment.LANES)
+    records = np.zeros((height, blocks * alignment.LANES, alignment.LIVE), np.float32)
+    records[:, :width] = np.stack(images, axis=-1)
+    records = records.reshape(height, blocks, alignment.LANES, alignment.LIVE)
+    return aligned(records.swapaxes(2, 3))
+
+
+def aligned(array):
+    """A copy that lanes can be loaded from."""
+    copy = runtime.empty(array.shape)
+    copy[:] = array
+    return copy
+
+
 def run_kernel(settings, T_ml, live, model):
-    """The kernel's rows of partial sums."""
-    partial = runtime.empty((live["depth"].shape[0] * alignment.SPLIT, alignment.PARTIAL))
-    partial.fill(np.nan)  # every entry must be written
-    images = [runtime.to_device(live[name]) for name in LIVE] + [runtime.to_device(model[name]) for name in MODEL]
-    alignment.normal_equations(
-        runtime.to_device(astuple(settings)), runtime.to_device(T_ml[:3].reshape(12)), *images, partial
-    )
-    return runtime.to_host(partial)
+    """The kernel's rows of sums, one for each part of the image."""
+    height, width = live["depth"].shape
+    values = np.zeros(alignment.SETTINGS, np.float32)
+    values[: alignment.GATE_LOW] = astuple(settings)
+    values[alignment.GATE_INVERSE_RANGE] = 1.0  # a gradient magnitude of 1 - T: the gate is T
+    values[alignment.POSE :] = T_ml[:3].reshape(12)
+    pixels = in_blocks([live["depth"], live["grey"], live["gx"], live["gy"], 1.0 - live["gate"]])
+    surface = aligned(np.concatenate([model["normal"], model["depth"][..., None]], axis=-1))
+    unused = [np.full((height, width), np.nan)] * 2
+    texture = aligned(np.stack([model[name] for name in TEXTURE] + unused, axis=-1))
+    parts = alignment.parts(height)
+    scratch = runtime.empty((parts, alignment.SUMS, alignment.LANES))
+    packed = runtime.empty((parts, alignment.PACKED_SUMS, alignment.LANES))
+    scratch.fill(np.nan)  # every entry must be written
+    packed.fill(np.nan)
+    alignment.normal_equations(runtime.to_device(values), pixels, surface, texture, scratch, packed)
+    rows = runtime.to_host(packed).reshape(parts, -1)
+    assert not rows[:, alignment.SUMS :].any()
+    assert rows[:, alignment.LIVE_PIXELS].sum() == (np.count_nonzero(live["depth"]) if min(height, width) > 3 else 0)
+    return rows[:, : alignment.SUMS]
 
 
 def by_name(partial):
@@ -140,7 +168,7 @@ def test_nothing_in_common_gives_zero(what):
         model["depth"] *= 3.0
     found = run_kernel(settings, T_ml, live, model)
     candidates = found[:, alignment.CANDIDATES].copy()
-    found[:, alignment.CANDIDATES] = 0
+    found[:, [alignment.CANDIDATES, alignment.LIVE_PIXELS]] = 0
     assert not found.any()
     assert (candidates.sum() > 0) == (what == "no match")
 

@@ -37,7 +37,7 @@ def errors_deg(found, normal):
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_luminance_halving_and_sobel_match_the_twin(rng, size):
+def test_luminance_halving_and_gradient_magnitude_match_the_twin(rng, size):
     colour = rng.random((*size, 3), np.float32)
     grey = images.luminance(runtime.to_device(colour))
     np.testing.assert_allclose(runtime.to_host(grey), reference.luminance(colour.astype(float)), atol=1e-6)
@@ -45,16 +45,51 @@ def test_luminance_halving_and_sobel_match_the_twin(rng, size):
         half = runtime.to_host(images.halve(runtime.to_device(image)))
         np.testing.assert_allclose(half, reference.halve(image.astype(float)), atol=1e-6)
     expected = reference.sobel(runtime.to_host(grey).astype(float))
-    for found, want in zip(images.sobel(grey), expected, strict=True):
-        np.testing.assert_allclose(runtime.to_host(found), want, atol=1e-6)
     np.testing.assert_allclose(runtime.to_host(images.sobel_magnitude(grey)), np.hypot(*expected), atol=1e-6)
 
 
-def test_sobel_of_a_ramp_is_its_slope():
+def test_gradient_magnitude_of_a_ramp_is_its_slope():
     v, u = np.mgrid[:20, :30]
-    grad_x, grad_y = images.sobel(runtime.to_device(0.02 * u - 0.01 * v))
-    np.testing.assert_allclose(runtime.to_host(grad_x)[1:-1, 1:-1], 0.02, atol=1e-6)
-    np.testing.assert_allclose(runtime.to_host(grad_y)[1:-1, 1:-1], -0.01, atol=1e-6)
+    magnitude = images.sobel_magnitude(runtime.to_device(0.03 * u - 0.04 * v))
+    np.testing.assert_allclose(runtime.to_host(magnitude)[1:-1, 1:-1], 0.05, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("halved", [False, True])
+def test_reduced_frames_and_renderings_match_the_twin(rng, size, halved):
+    colour, opacity = rng.random((*size, 3), np.float32), rng.random(size, np.float32)
+    depth = rng.choice([1.0, 1.02, 1.049, 1.06, 2.0, 2.05, 0.0], size).astype(np.float32)
+    reduced = tuple(n // 2 for n in size) if halved else size
+    grey, small = runtime.empty(reduced), runtime.empty(reduced)
+    luma = reference.luminance(colour.astype(float))
+    luma = reference.halve(luma) if halved else luma
+
+    def expected_depth(image):
+        return reference.halve_depth(image.astype(float), images.DEPTH_EDGE) if halved else image
+
+    images.reduce_frame(*(runtime.to_device(image) for image in (colour, depth)), grey, small)
+    np.testing.assert_allclose(runtime.to_host(grey), luma, atol=1e-6)
+    np.testing.assert_allclose(runtime.to_host(small), expected_depth(depth), rtol=1e-6)
+    rendering = [runtime.to_device(image) for image in (colour, depth * opacity, opacity)]
+    images.reduce_rendering(*rendering, 0.4, grey, small)
+    np.testing.assert_allclose(runtime.to_host(grey), luma, atol=1e-6)
+    np.testing.assert_allclose(runtime.to_host(small), expected_depth(np.where(opacity > 0.4, depth, 0.0)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_halving_a_pair_is_halving_each(rng, size):
+    grey = runtime.to_device(rng.random(size))
+    depth = runtime.to_device(rng.choice([0.0, 1.0, 1.03, 1.2], size))
+    halves = [runtime.empty((size[0] // 2, size[1] // 2)) for _ in range(2)]
+    images.halve_pair(grey, depth, *halves)
+    np.testing.assert_array_equal(runtime.to_host(halves[0]), runtime.to_host(images.halve(grey)))
+    np.testing.assert_array_equal(runtime.to_host(halves[1]), runtime.to_host(images.halve_depth(depth)))
+
+
+def test_a_sample_is_a_grid_of_some_120_rows(rng):
+    for size, step in (((480, 640), 4), ((250, 261), 2), ((37, 51), 1)):
+        image = rng.random(size, np.float32)
+        np.testing.assert_array_equal(images.sampled(runtime.to_device(image)), image[::step, ::step])
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -153,9 +188,13 @@ def test_wrong_images_are_named():
     with pytest.raises(ValueError, match=r"colour must have shape \[any, any, 3\]"):
         images.luminance(runtime.zeros((4, 4)))
     with pytest.raises(ValueError, match="image must be float32"):
-        images.sobel(np.zeros((4, 4)))
+        images.sobel_magnitude(np.zeros((4, 4)))
     with pytest.raises(ValueError, match="C-contiguous"):
-        images.sobel(np.zeros((4, 8), np.float32)[:, ::2])
+        images.sobel_magnitude(np.zeros((4, 8), np.float32)[:, ::2])
+    with pytest.raises(ValueError, match=r"grey must have shape \[2, 3\]"):
+        images.reduce_frame(
+            runtime.zeros((4, 6, 3)), runtime.zeros((4, 6)), runtime.zeros((3, 6)), runtime.zeros((2, 3))
+        )
     with pytest.raises(ValueError, match="cannot be halved"):
         images.halve(runtime.zeros((1, 4)))
     with pytest.raises(ValueError, match="out must have shape"):

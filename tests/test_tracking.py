@@ -14,6 +14,7 @@ from tgslam.config.schema import Config, LossConfig, SyntheticConfig, TrackingCo
 from tgslam.datasets.synthetic import SyntheticSource
 from tgslam.gaussian_map import GaussianMap
 from tgslam.geometry import inverse, se3_exp, se3_log
+from tgslam.kernels import alignment
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.mapper import Mapper
 from tgslam.render import RenderImages
@@ -22,7 +23,7 @@ from tgslam.tracking.first_order import FirstOrderTracker
 from tgslam.tracking.gauss_newton import GaussNewtonTracker
 from tgslam.tracking.lost import LostDetector
 from tgslam.tracking.motion import ConstantVelocity
-from tgslam.tracking.pyramid import finest_level, live_pyramid, model_pyramid
+from tgslam.tracking.pyramid import LiveLevel, LivePyramid, ModelLevel, ModelPyramid, finest_level
 from tgslam.tracking.result import TrackingResult
 from tgslam.tracking.solver import make_tracker, track_or_recover
 from tgslam.types import Camera, Frame
@@ -330,12 +331,20 @@ def test_texture_determines_what_one_plane_leaves_open():
     assert not result.lost and angle_deg < 0.05 and distance_mm < 2.0
 
 
-def twin_images(level: object, names: dict[str, str]) -> dict[str, np.ndarray]:
-    return {name: runtime.to_host(getattr(level, of)).astype(float) for name, of in names.items()}
+def live_images(level: LiveLevel) -> dict[str, np.ndarray]:
+    """What the kernel is given of a frame, as the twin takes it."""
+    pixels = runtime.to_host(level.pixels).swapaxes(2, 3).astype(float)
+    pixels = pixels.reshape(level.camera.height, -1, alignment.LIVE)[:, : level.camera.width]
+    images = dict(zip(("depth", "grey", "gx", "gy"), np.moveaxis(pixels, -1, 0), strict=False))
+    strength = pixels[..., alignment.LIVE_STRENGTH]
+    return images | {"gate": 1 - np.clip((strength - level.gate_low) * level.gate_inverse_range, 0, 1)}
 
 
-GREY = {"depth": "depth", "grey": "grey", "gx": "grad_x", "gy": "grad_y"}
-SECOND = {"gxx": "grad_xx", "gxy": "grad_xy", "gyy": "grad_yy", "normal": "normal"}
+def model_images(level: ModelLevel) -> dict[str, np.ndarray]:
+    """What the kernel is given of the model, as the twin takes it."""
+    surface, texture = (runtime.to_host(array).astype(float) for array in (level.surface, level.texture))
+    images = dict(zip(("grey", "gx", "gy", "gxx", "gxy", "gyy"), np.moveaxis(texture, -1, 0), strict=False))
+    return images | {"normal": surface[..., :3], "depth": surface[..., alignment.MODEL_DEPTH]}
 
 
 def test_the_information_is_how_the_cost_grows_with_the_pose():
@@ -345,9 +354,8 @@ def test_the_information_is_how_the_cost_grows_with_the_pose():
     frame = scene.frame(MOTION)
     result = exact_tracker(scene).track(frame, None, T_mw, Exposure())
     loss = LossConfig()
-    live = twin_images(live_pyramid(frame, TINY, 0, 1, loss)[0], GREY | {"gate": "gate"})
-    grey, depth = (runtime.to_device(image) for image in scene.images(T_mw))
-    model = twin_images(model_pyramid(grey, depth, TINY, 1, loss.depth_sigma_per_m2)[0], GREY | SECOND)
+    live = live_images(LivePyramid(TINY, 0, 1, loss).update(frame)[0])
+    model = model_images(ModelPyramid(TINY, 0, 1, loss, CONFIG.min_opacity).update(scene.forward(None, T_mw))[0])
     settings = reference.Settings(
         TINY.fx, TINY.fy, TINY.cx, TINY.cy, result.exposure.gain, result.exposure.bias,
         loss.depth_sigma_per_m2, CONFIG.max_distance_sigmas, loss.charbonnier_depth_sigmas, loss.gate_depth_boost,

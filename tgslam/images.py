@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tgslam import runtime
 from tgslam.arrays import require
+from tgslam.kernels import alignment
 from tgslam.kernels import image as kernels
 from tgslam.types import Camera
 
+STEEPEST_RAD = 1.3  # between a surface's normal and the optical axis
 DEPTH_EDGE = 0.05  # measurements farther apart than this part of their depth lie on different surfaces
-_PERCENTILE_ROWS = 120  # the gate's percentiles come from a grid of about this many rows
+_SAMPLE_ROWS = 120  # percentiles come from a grid of about this many rows
 
 
 def luminance(colour: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
@@ -37,6 +40,38 @@ def halve(image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
     return out
 
 
+def reduce_frame(colour: np.ndarray, depth_m: np.ndarray, grey: np.ndarray, reduced_m: np.ndarray) -> None:
+    """Write luminance and depth of a frame, [H, W, 3] and [H, W], into images of its size or of half of it."""
+    size = _reduction(colour, depth_m, grey, reduced_m)
+    kernels.reduce_frame(colour, depth_m, size, DEPTH_EDGE, grey, reduced_m)
+
+
+def reduce_rendering(
+    colour: np.ndarray,
+    depth: np.ndarray,
+    opacity: np.ndarray,
+    min_opacity: float,
+    grey: np.ndarray,
+    reduced_m: np.ndarray,
+) -> None:
+    """Write luminance and depth of a rendering (depth accumulated) into images of its size or of half of it.
+
+    Pixels of no more than min_opacity have no depth. Colours are fitted to be seen over black and are not divided.
+    """
+    size = _reduction(colour, depth, grey, reduced_m)
+    require("opacity", opacity, depth.shape)
+    kernels.reduce_rendering(colour, depth, opacity, min_opacity, size, DEPTH_EDGE, grey, reduced_m)
+
+
+def halve_pair(grey: np.ndarray, depth_m: np.ndarray, half_grey: np.ndarray, half_m: np.ndarray) -> None:
+    """`halve` and `halve_depth` of images [H, W] in one pass."""
+    require("grey", grey, (None, None))
+    require("depth_m", depth_m, grey.shape)
+    require("half_grey", half_grey, _halved(grey.shape))
+    require("half_m", half_m, half_grey.shape)
+    kernels.halve_pair(grey, depth_m, DEPTH_EDGE, half_grey, half_m)
+
+
 def halve_depth(depth_m: np.ndarray, relative: float = DEPTH_EDGE, out: np.ndarray | None = None) -> np.ndarray:
     """Half-size depth: float32 [H, W] in m, 0 = none -> [H // 2, W // 2].
 
@@ -47,14 +82,6 @@ def halve_depth(depth_m: np.ndarray, relative: float = DEPTH_EDGE, out: np.ndarr
     out = _output(out, _halved(depth_m.shape))
     kernels.halve_depth(depth_m, relative, out)
     return out
-
-
-def sobel(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sobel gradients over 8, per pixel, of float32 [H, W]: a pair of [H, W] (d/dx, d/dy), edges replicated."""
-    require("image", image, (None, None))
-    grad_x, grad_y = runtime.empty(image.shape), runtime.empty(image.shape)
-    kernels.sobel(image, grad_x, grad_y)
-    return grad_x, grad_y
 
 
 def sobel_magnitude(image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
@@ -75,11 +102,29 @@ def texture_gate(
     intensity per pixel; it keeps sensor noise on a blank wall from counting as texture. A constant image gives 1.
     """
     out = sobel_magnitude(grey, out)
-    step = max(1, min(grey.shape) // _PERCENTILE_ROWS)
-    sample = runtime.to_host(out)[::step, ::step]
-    low, high = np.percentile(sample, (100.0 - percentile, percentile))
-    kernels.gate(out, low, 1.0 / (high - low + noise_floor), out)
+    low, inverse_range = gate_range(sampled(out), percentile, noise_floor)
+    kernels.gate(out, low, inverse_range, out)
     return out
+
+
+def gate_range(strength: NDArray[np.float32], percentile: float, noise_floor: float) -> tuple[float, float]:
+    """G_min of Eq. 11 and 1 / (G_max - G_min + epsilon) from sampled gradient magnitudes; see `texture_gate`."""
+    ordered = np.sort(strength, axis=None)
+    low, high = (_percentile(ordered, p) for p in (100.0 - percentile, percentile))
+    return low, 1.0 / (high - low + noise_floor)
+
+
+def sample_step(shape: tuple[int, ...]) -> int:
+    """Pixels between those of a regular grid that stands for an image of that shape."""
+    return max(1, min(shape[:2]) // _SAMPLE_ROWS)
+
+
+def sampled(image: np.ndarray) -> NDArray[np.float32]:
+    """A regular grid of some 120 rows of float32 [H, W], on the host: for percentiles."""
+    step = sample_step(image.shape)
+    sample = runtime.empty((-(-image.shape[0] // step), -(-image.shape[1] // step)))
+    kernels.sample_grid(image, step, sample)
+    return runtime.to_host(sample)
 
 
 def normals(
@@ -87,7 +132,7 @@ def normals(
     camera: Camera,
     radius: int = 3,
     sigma_per_m2: float = 0.0015,
-    steepest_rad: float = 1.3,
+    steepest_rad: float = STEEPEST_RAD,
     out: np.ndarray | None = None,
 ) -> np.ndarray:
     """Unit surface normals from float32 [H, W] depth in m -> [H, W, 3], camera frame, towards the camera.
@@ -104,11 +149,52 @@ def normals(
     height, width = depth_m.shape
     out = _output(out, (height, width, 3))
     blocks = runtime.empty(_halved(depth_m.shape))
+    _fit_normals(depth_m, camera, radius, sigma_per_m2, steepest_rad, blocks, out)
+    return out
+
+
+def surface(
+    depth_m: np.ndarray, camera: Camera, radius: int, sigma_per_m2: float, blocks: np.ndarray, out: np.ndarray
+) -> None:
+    """Write `normals` and the depth side by side: out float32 [H, W, 4]. blocks: scratch [H // 2, W // 2]."""
+    require("depth_m", depth_m, (camera.height, camera.width))
+    require("blocks", blocks, _halved(depth_m.shape))
+    require("out", out, (*depth_m.shape, alignment.SURFACE))
+    _fit_normals(depth_m, camera, radius, sigma_per_m2, STEEPEST_RAD, blocks, out)
+
+
+def _fit_normals(
+    depth_m: np.ndarray,
+    camera: Camera,
+    radius: int,
+    sigma_per_m2: float,
+    steepest_rad: float,
+    blocks: np.ndarray,
+    out: np.ndarray,
+) -> None:
     kernels.inverse_depth_blocks(depth_m, DEPTH_EDGE, blocks)
     kernels.normals(
-        depth_m, blocks, camera.fx, camera.fy, camera.cx, camera.cy, radius, sigma_per_m2, math.tan(steepest_rad), out
-    )
-    return out
+        depth_m, blocks, camera.fx, camera.fy, camera.cx, camera.cy, radius, sigma_per_m2, math.tan(steepest_rad),
+        out.shape[2] == alignment.SURFACE, out,
+    )  # fmt: skip
+
+
+def _percentile(ordered: NDArray[np.float32], percentile: float) -> float:
+    """As `np.percentile`, of values in ascending order: several then need one sort."""
+    rank = percentile / 100.0 * (ordered.size - 1)
+    below = int(rank)
+    low, high = float(ordered[below]), float(ordered[min(below + 1, ordered.size - 1)])
+    return low + (rank - below) * (high - low)
+
+
+def _reduction(colour: np.ndarray, depth: np.ndarray, grey: np.ndarray, reduced: np.ndarray) -> int:
+    """Pixels that become one, 1 or 2, either way."""
+    height, width = require("colour", colour, (None, None, 3)).shape[:2]
+    require("depth", depth, (height, width))
+    size = 1 if tuple(grey.shape) == (height, width) else 2
+    require("grey", grey, (height // size, width // size))
+    require("reduced", reduced, grey.shape)
+    return size
 
 
 def _halved(shape: tuple[int, ...]) -> tuple[int, int]:

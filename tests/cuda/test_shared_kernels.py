@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.cuda.harness import GRIDS, Devices, assert_close
-from tests.cuda.scenarios import adam, alignment, images, projection, relaxation
+from tests.cuda.scenarios import adam, images, projection, relaxation
 from tools.cudacheck.environment import Grid
 
 pytestmark = [pytest.mark.cuda_check, pytest.mark.parametrize("grid", GRIDS)]
@@ -40,8 +40,3 @@ def test_projection(devices: Devices, grid: Grid, with_embedding: bool) -> None:
     for name, expected in cpu.items():
         scale = np.abs(expected).max(axis=0, keepdims=True) if expected.ndim > 1 else np.abs(expected).max()
         np.testing.assert_allclose(cuda[name] / (scale + 1e-30), expected / (scale + 1e-30), atol=2e-5, err_msg=name)
-
-
-def test_alignment(devices: Devices, grid: Grid) -> None:
-    cpu, cuda = devices.both(alignment.normal_equations, grid)
-    np.testing.assert_allclose(cuda["sums"], cpu["sums"], rtol=1e-5, atol=1e-5 * np.abs(cpu["sums"]).max())

@@ -1,4 +1,7 @@
-"""What alignment needs of an image pair, fine to coarse: for the live frame and for the rendered model."""
+"""What alignment needs of an image pair, fine to coarse: for the live frame and for the rendered model.
+
+The memory is taken once and written anew for each frame.
+"""
 
 from __future__ import annotations
 
@@ -8,34 +11,31 @@ import numpy as np
 
 from tgslam import images, runtime
 from tgslam.config.schema import LossConfig
+from tgslam.kernels import alignment
+from tgslam.kernels import image as kernels
+from tgslam.render import RenderImages
 from tgslam.types import Camera, Frame
 
+_NORMAL_RADIUS = 1  # blocks of 2x2 px on each side: a rendered surface has little noise
 
-@dataclass(frozen=True)
+
+@dataclass
 class LiveLevel:
-    """One resolution of the live frame, as device arrays."""
+    """One resolution of the live frame."""
 
     camera: Camera
-    depth: np.ndarray  # [H, W] m
-    grey: np.ndarray  # [H, W]
-    grad_x: np.ndarray  # [H, W] 1/px
-    grad_y: np.ndarray  # [H, W]
-    gate: np.ndarray  # [H, W] T of Eq. 11
+    pixels: np.ndarray  # device array [H, B, LIVE, 16], see `kernels.alignment`; B = ceil(W / 16)
+    gate_low: float = 0.0  # G_min of Eq. 11, 1/px
+    gate_inverse_range: float = 0.0  # 1 / (G_max - G_min + epsilon)
 
 
 @dataclass(frozen=True)
 class ModelLevel:
-    """One resolution of the rendered model, as device arrays."""
+    """One resolution of the rendered model."""
 
     camera: Camera
-    depth: np.ndarray  # [H, W] m, 0 = not covered by the map
-    grey: np.ndarray  # [H, W]
-    normal: np.ndarray  # [H, W, 3]
-    grad_x: np.ndarray  # [H, W]
-    grad_y: np.ndarray  # [H, W]
-    grad_xx: np.ndarray  # [H, W]
-    grad_xy: np.ndarray  # [H, W]
-    grad_yy: np.ndarray  # [H, W]
+    surface: np.ndarray  # device array [H, W, SURFACE], see `kernels.alignment`; no depth where the map says nothing
+    texture: np.ndarray  # device array [H, W, TEXTURE]
 
 
 def finest_level(camera: Camera, finest_width_px: int) -> int:
@@ -46,33 +46,92 @@ def finest_level(camera: Camera, finest_width_px: int) -> int:
     return level
 
 
-def live_pyramid(frame: Frame, camera: Camera, first: int, levels: int, loss: LossConfig) -> list[LiveLevel]:
+class LivePyramid:
     """Levels of a frame, finest first: the frame halved `first` times, then once more for each next level."""
-    depth, grey = runtime.to_device(frame.depth_m), images.luminance(runtime.to_device(frame.colour))
-    for _ in range(first):
-        depth, grey = images.halve_depth(depth), images.halve(grey)
-    result = []
-    for level in range(levels):
-        if level:
-            depth, grey = images.halve_depth(depth), images.halve(grey)
-        grad_x, grad_y = images.sobel(grey)
-        gate = images.texture_gate(grey, loss.gate_percentile, loss.gate_noise_floor)
-        result.append(LiveLevel(camera.halved(first + level), depth, grey, grad_x, grad_y, gate))
-    return result
+
+    def __init__(self, camera: Camera, first: int, levels: int, loss: LossConfig) -> None:
+        self.loss, self._images = loss, _ImagePyramid(camera, first, levels)
+        self.levels = [_live_level(camera.halved(first + level)) for level in range(levels)]
+        self._samples = [_sample_for(level.camera) for level in self.levels]
+
+    def update(self, frame: Frame) -> list[LiveLevel]:
+        """Take in a frame; the result is valid until the next one."""
+        base = self._images.base
+        images.reduce_frame(runtime.to_device(frame.colour), runtime.to_device(frame.depth_m), base.grey, base.depth)
+        for level, pair, sample in zip(self.levels, self._images.halvings(), self._samples, strict=True):
+            kernels.pack_live(pair.grey, pair.depth, level.pixels)
+            kernels.sample_strength(level.pixels, images.sample_step((level.camera.height, level.camera.width)), sample)
+            level.gate_low, level.gate_inverse_range = images.gate_range(
+                runtime.to_host(sample), self.loss.gate_percentile, self.loss.gate_noise_floor
+            )
+        return self.levels
 
 
-def model_pyramid(
-    grey: np.ndarray, depth: np.ndarray, camera: Camera, levels: int, sigma_per_m2: float
-) -> list[ModelLevel]:
-    """Levels of a rendered image pair, finest first. grey [H, W], depth [H, W] m with 0 where the map says nothing."""
-    result = []
-    for level in range(levels):
-        if level:
-            depth, grey = images.halve_depth(depth), images.halve(grey)
-        level_camera = camera.halved(level)
-        grad_x, grad_y = images.sobel(grey)
-        grad_xx, grad_xy = images.sobel(grad_x)
-        _, grad_yy = images.sobel(grad_y)
-        normal = images.normals(depth, level_camera, radius=1, sigma_per_m2=sigma_per_m2)
-        result.append(ModelLevel(level_camera, depth, grey, normal, grad_x, grad_y, grad_xx, grad_xy, grad_yy))
-    return result
+class ModelPyramid:
+    """Levels of a rendering of the map, finest first, of the same sizes as those of `LivePyramid`."""
+
+    def __init__(self, camera: Camera, first: int, levels: int, loss: LossConfig, min_opacity: float) -> None:
+        """min_opacity: pixels that the map covers no more than that are left out."""
+        self.loss, self.min_opacity, self._images = loss, min_opacity, _ImagePyramid(camera, first, levels)
+        self.levels = [_model_level(camera.halved(first + level)) for level in range(levels)]
+        self._blocks = [runtime.empty((level.camera.height // 2, level.camera.width // 2)) for level in self.levels]
+
+    def update(self, rendered: RenderImages) -> list[ModelLevel]:
+        """Take in a rendering at full size; the result is valid until the next one."""
+        base = self._images.base
+        images.reduce_rendering(
+            rendered.colour, rendered.depth, rendered.opacity, self.min_opacity, base.grey, base.depth
+        )
+        for level, pair, blocks in zip(self.levels, self._images.halvings(), self._blocks, strict=True):
+            kernels.pack_texture(pair.grey, level.texture)
+            kernels.pack_second_derivatives(level.texture)
+            images.surface(
+                pair.depth, level.camera, _NORMAL_RADIUS, self.loss.depth_sigma_per_m2, blocks, level.surface
+            )
+        return self.levels
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Luminance and depth of one resolution, as device arrays [H, W]."""
+
+    grey: np.ndarray
+    depth: np.ndarray
+
+    @classmethod
+    def empty(cls, camera: Camera) -> _Pair:
+        return cls(runtime.empty((camera.height, camera.width)), runtime.empty((camera.height, camera.width)))
+
+
+class _ImagePyramid:
+    """Luminance and depth at each resolution from `base` down, which is half the camera's unless `first` is 0."""
+
+    def __init__(self, camera: Camera, first: int, levels: int) -> None:
+        self._skipped = max(first - 1, 0)  # halvings before the finest level that the base does not save
+        self._pairs = [_Pair.empty(camera.halved(level)) for level in range(min(first, 1), first + levels)]
+
+    @property
+    def base(self) -> _Pair:
+        """To be filled with the frame before `halvings`."""
+        return self._pairs[0]
+
+    def halvings(self) -> list[_Pair]:
+        """Halve the base again and again; returns the levels that alignment uses, finest first."""
+        for pair, half in zip(self._pairs, self._pairs[1:], strict=False):
+            images.halve_pair(pair.grey, pair.depth, half.grey, half.depth)
+        return self._pairs[self._skipped :]
+
+
+def _live_level(camera: Camera) -> LiveLevel:
+    blocks = -(-camera.width // alignment.LANES)
+    return LiveLevel(camera, runtime.empty((camera.height, blocks, alignment.LIVE, alignment.LANES)))
+
+
+def _model_level(camera: Camera) -> ModelLevel:
+    size = (camera.height, camera.width)
+    return ModelLevel(camera, runtime.zeros((*size, alignment.SURFACE)), runtime.zeros((*size, alignment.TEXTURE)))
+
+
+def _sample_for(camera: Camera) -> np.ndarray:
+    step = images.sample_step((camera.height, camera.width))
+    return runtime.empty((-(-camera.height // step), -(-camera.width // step)))

@@ -30,13 +30,10 @@ def colour(height: int = 37, width: int = 50) -> dict[str, np.ndarray]:
     """All that is made of a colour image; the size is no multiple of anything."""
     rgb = runtime.to_device(_rgbd(height, width)[0])
     grey = images.luminance(rgb)
-    grad_x, grad_y = images.sobel(grey)
     return _on_host(
         grey=grey,
         half_grey=images.halve(grey),
         half_colour=images.halve(rgb),
-        grad_x=grad_x,
-        grad_y=grad_y,
         magnitude=images.sobel_magnitude(grey),
         gate=images.texture_gate(grey),
     )

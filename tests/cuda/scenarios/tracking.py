@@ -1,0 +1,73 @@
+"""What a tracked frame takes: the levels of the frame and of the model, and the equations between them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tests.cuda.harness import scenario
+from tgslam import runtime
+from tgslam.config.schema import LossConfig, TrackingConfig
+from tgslam.geometry import se3_exp
+from tgslam.kernels import alignment
+from tgslam.render import RenderImages
+from tgslam.tracking.exposure import Exposure
+from tgslam.tracking.linearisation import Lineariser
+from tgslam.tracking.pyramid import LivePyramid, ModelPyramid
+from tgslam.types import Camera, Frame
+
+_LOSS = LossConfig()
+_MIN_OPACITY = 0.5
+
+
+def _view(height: int, width: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Colour and noisy depth of a slanted surface with a step and holes."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[:height, :width]
+    depth_m = 2.0 + 0.01 * u - 0.006 * v + 0.3 * (u > 0.7 * width) + 0.002 * rng.normal(size=(height, width))
+    depth_m[rng.random(depth_m.shape) < 0.05] = 0.0
+    grey = 0.5 + 0.2 * np.sin(0.5 * u + 0.3) * np.cos(0.4 * v) + 0.03 * rng.normal(size=(height, width))
+    return (grey[..., None] * np.array([1.0, 0.9, 0.8])).astype(np.float32), depth_m.astype(np.float32)
+
+
+def _camera(height: int, width: int) -> Camera:
+    return Camera(width, height, 0.9 * width, 0.95 * width, 0.5 * width - 0.3, 0.5 * height - 0.8)
+
+
+def _rendering(height: int, width: int) -> RenderImages:
+    colour, depth_m = _view(height, width, seed=1)
+    opacity = np.random.default_rng(2).uniform(0.45, 1.0, depth_m.shape)
+    arrays = (colour, depth_m * opacity, opacity, np.zeros_like(colour))
+    return RenderImages(*(runtime.to_device(array) for array in arrays))
+
+
+@scenario
+def levels(height: int = 37, width: int = 50, first: int = 1) -> dict[str, np.ndarray]:
+    """Everything that alignment reads, at two resolutions."""
+    camera = _camera(height, width)
+    live = LivePyramid(camera, first, 2, _LOSS).update(Frame(0, 0.0, *_view(height, width, seed=0)))
+    model = ModelPyramid(camera, first, 2, _LOSS, _MIN_OPACITY).update(_rendering(height, width))
+    result = {}
+    for k in range(2):
+        result[f"gate_{k}"] = np.array([live[k].gate_low, live[k].gate_inverse_range])
+        result[f"pixels_{k}"] = runtime.to_host(live[k].pixels)
+        result[f"surface_{k}"] = runtime.to_host(model[k].surface)
+        result[f"texture_{k}"] = runtime.to_host(model[k].texture)[..., : alignment.GYY + 1]
+    return result
+
+
+@scenario
+def normal_equations(height: int = 37, width: int = 50) -> dict[str, np.ndarray]:
+    """The equations at a pose and an exposure off the true ones."""
+    camera = _camera(height, width)
+    (live,) = LivePyramid(camera, 0, 1, _LOSS).update(Frame(0, 0.0, *_view(height, width, seed=0)))
+    (model,) = ModelPyramid(camera, 0, 1, _LOSS, _MIN_OPACITY).update(_rendering(height, width))
+    T_ml = se3_exp([0.02, -0.03, 0.015, 0.02, -0.015, 0.03])
+    found = Lineariser(camera, TrackingConfig(), _LOSS)(live, model, T_ml, Exposure(1.1, -0.04))
+    intensity = found.intensity
+    return {
+        "A": found.A,
+        "b": found.b,
+        "counts": np.array([found.live_pixels, found.candidates, found.matched, found.inliers]),
+        "residuals": np.array([found.depth_residual, found.colour_residual]),
+        "moments": np.array([intensity.w, intensity.l, intensity.m, intensity.ll, intensity.lm]),
+    }
