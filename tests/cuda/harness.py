@@ -21,11 +21,13 @@ Gaussians, images of 64x48; the emulation does some 10^8 PTX instructions a seco
         cpu, cuda = devices.both(adam.steps, grid, rows=40)
         assert_close(cuda, cpu, rtol=1e-5, atol=1e-7)
 
-`devices` (a fixture for the whole session) keeps one process for each device and grid mode, so that Taichi starts and
-compiles once; results are kept too. `devices.cpu(f, **arguments)` and `devices.cuda(f, grid, **arguments)` give one
-side; a scenario for CUDA alone is compared with what the test computes. They raise ScenarioError, with what the process
-wrote, if the scenario raises, crashes (an LLVM abort, a segmentation fault) or hangs, or if the check reports anything
-(a `cudastub:` line). The next scenario gets a new process then, so one failure hides no other.
+`devices` (a fixture for the whole session) keeps a process for each of the two devices, and starts a new one for the
+next grid mode; tests with a parameter `grid` are ordered by it. Results are kept, as is all that was compiled: in the
+cache of `tools.cudacheck`, where the next mode and the next session find it. `devices.cpu(f, **arguments)` and
+`devices.cuda(f, grid, **arguments)` give one side; a scenario for CUDA alone is compared with what the test computes.
+They raise ScenarioError, with what the process wrote, if the scenario raises, crashes (an LLVM abort, a segmentation
+fault) or hangs, or if the check reports anything (a `cudastub:` line). The next scenario gets a new process then, so
+one failure hides no other.
 
 All kernels that the scenarios launch are also assembled and held against `tools/cudacheck/budgets.yaml`
 (test_budgets.py); after a change: `python -m tests.cuda.harness --write-budgets`.
@@ -96,11 +98,12 @@ def assert_close(found: Results, expected: Results, *, rtol: float = 0.0, atol: 
 
 
 class Devices:
-    """Processes in which scenarios run: one on the CPU, one for each grid mode, each started when first needed."""
+    """Processes in which scenarios run: one on the CPU, one with emulated CUDA kernels, started when first needed."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._workers: dict[Grid | None, _Worker] = {}
+        self._cpu: _Worker | None = None
+        self._cuda: _Worker | None = None
         self._results: dict[tuple[Grid | None, str], Results | ScenarioError] = {}
 
     def cpu(self, function: Scenario, **arguments: Any) -> Results:
@@ -123,24 +126,35 @@ class Devices:
 
     def close(self) -> None:
         """End all processes."""
-        for worker in self._workers.values():
-            worker.close()
+        for worker in (self._cpu, self._cuda):
+            if worker:
+                worker.close()
 
     def _run(self, grid: Grid | None, function: Scenario, arguments: dict[str, Any]) -> Results:
         request = json.dumps([function.__module__, function.__name__, arguments], sort_keys=True)
         key = (grid, request)
         if key not in self._results:
-            worker = self._workers.get(grid)
-            if worker is None or not worker.usable:
-                worker = self._workers[grid] = _Worker(self._new_folder(grid), grid)
             try:
-                self._results[key] = worker.run(request)
+                self._results[key] = self._worker(grid).run(request)
             except ScenarioError as error:
                 self._results[key] = error
         result = self._results[key]
         if isinstance(result, ScenarioError):
             raise ScenarioError(str(result))
         return result
+
+    def _worker(self, grid: Grid | None) -> _Worker:
+        """The process of that device, in that grid mode: there is one at a time."""
+        worker = self._cpu if grid is None else self._cuda
+        if worker is None or not worker.usable or worker.grid is not grid:
+            if worker:
+                worker.close()
+            worker = _Worker(self._new_folder(grid), grid)
+            if grid is None:
+                self._cpu = worker
+            else:
+                self._cuda = worker
+        return worker
 
     def _new_folder(self, grid: Grid | None) -> Path:
         name = "cpu" if grid is None else grid.value
@@ -153,7 +167,8 @@ class _Worker:
     """A process that runs scenarios one after another until one goes wrong."""
 
     def __init__(self, folder: Path, grid: Grid | None) -> None:
-        self._folder, self.usable, self._count = folder, True, 0
+        self.grid, self.usable = grid, True
+        self._folder, self._count = folder, 0
         added = {} if grid is None else environment(folder, execute=True, grid=grid)
         self._answers, descriptor = os.pipe()
         with (folder / _OUTPUT).open("wb") as output:
@@ -185,7 +200,7 @@ class _Worker:
         if self._process.stdin:
             self._process.stdin.close()
         try:
-            self._process.wait(timeout=10)
+            self._process.wait(timeout=60)  # it writes what Taichi has compiled to its cache
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()

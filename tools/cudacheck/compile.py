@@ -12,6 +12,7 @@ from tools.cudacheck.translator import translate
 
 NATIVE = Path(__file__).parent / "native"
 # No contraction: PTX says itself where it multiplies and adds in one rounding. No strict aliasing: registers are bits.
+# -O2 runs no faster than -O1 (measured on a tile rasterizer) and takes half as long again; -O0 runs 6 times as long.
 # The level 3 of x86-64 has the fused multiply-add as an instruction, which every CPU of the last ten years knows.
 FLAGS = ("-O1", "-march=x86-64-v3", "-ffp-contract=off", "-fno-strict-aliasing", "-fwrapv", "-w")
 

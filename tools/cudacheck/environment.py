@@ -100,13 +100,14 @@ def environment(dump: Path, *, execute: bool, grid: Grid = Grid.DEFAULT) -> dict
     execute: run kernels on the CPU; otherwise launches do nothing.
     Raises MissingToolError without gcc, CudaCheckError if the driver does not build.
     """
-    modules = cache_folder() / "modules"
-    modules.mkdir(parents=True, exist_ok=True)
+    modules, taichi = cache_folder() / "modules", cache_folder() / "taichi"
+    for folder in (modules, taichi):
+        folder.mkdir(parents=True, exist_ok=True)
     key = _digest([_PACKAGE / name for name in _TRANSLATOR], FLAGS)
     return {
         "LD_LIBRARY_PATH": _joined(driver_folder(), "LD_LIBRARY_PATH"),
         "PYTHONPATH": _joined(_CHECKOUT, "PYTHONPATH"),  # the driver runs tools.cudacheck.compile
-        "TI_OFFLINE_CACHE_FILE_PATH": str(dump / "taichi"),  # a real GPU's cache must neither serve nor suffer
+        "TI_OFFLINE_CACHE_FILE_PATH": str(taichi),  # apart from what Taichi has compiled for a real GPU
         "CUDACHECK_DUMP": str(dump),
         "CUDACHECK_MODULES": str(modules),
         "CUDACHECK_PYTHON": sys.executable,
