@@ -29,6 +29,8 @@ from tgslam.kernels.simd import (
     lane_max,
     lane_sum,
     lanes_kernel,
+    larger,
+    smaller,
     sums_of_4,
     sums_of_16,
 )
@@ -117,9 +119,9 @@ def pack_tile(
         xa, ya = chunk_x - u, chunk_y - v
         xb, yb = xa + (CHUNK - 1.0), ya + (CHUNK - 1.0)
         # the chunk's lines nearest to the centre, and the least exponent on each
-        xn, yn = ti.min(ti.max(xa, 0.0), xb), ti.min(ti.max(ya, 0.0), yb)
-        y1, x1 = ti.min(ti.max(slope_y * xn, ya), yb), ti.min(ti.max(slope_x * yn, xa), xb)
-        q = ti.min((a * xn + b * y1) * xn + c * y1 * y1, (a * x1 + b * yn) * x1 + c * yn * yn)
+        xn, yn = smaller(larger(xa, Lanes(0.0)), xb), smaller(larger(ya, Lanes(0.0)), yb)
+        y1, x1 = smaller(larger(slope_y * xn, ya), yb), smaller(larger(slope_x * yn, xa), xb)
+        q = smaller((a * xn + b * y1) * xn + c * y1 * y1, (a * x1 + b * yn) * x1 + c * yn * yn)
         mask[k] = ti.cast(lane_sum(ti.select(q <= Lanes(reach), powers, Lanes(0.0))), ti.i32)
 
 

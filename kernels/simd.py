@@ -54,12 +54,24 @@ def _is_vector(x: object) -> bool:
 
 
 @ti.func
+def smaller(a, b):
+    """The smaller of two Lanes (of two scalars) in one instruction; `ti.min` takes three, which handle NaN."""
+    return ti.select(a < b, a, b)
+
+
+@ti.func
+def larger(a, b):
+    """The larger of two Lanes (of two scalars), likewise."""
+    return ti.select(a > b, a, b)
+
+
+@ti.func
 def at_most(x, bound: ti.template()):
-    """The smaller of x and a constant in one instruction; `ti.min` takes three, which handle NaN."""
+    """`smaller` of x and a constant."""
     if ti.static(_is_vector(x)):
-        return ti.select(x < Lanes(bound), x, Lanes(bound))
+        return smaller(x, Lanes(bound))
     else:
-        return ti.select(x < bound, x, bound)
+        return smaller(x, bound)
 
 
 @ti.func
@@ -98,7 +110,7 @@ def lane_sum(v):
 def lane_max(v):
     """Largest of the lanes."""
     for k in ti.static(range(4)):
-        v = ti.max(v, swapped(v, 8 >> k))
+        v = larger(v, swapped(v, 8 >> k))
     return v[0]
 
 
