@@ -290,7 +290,7 @@ def test_run_compiles_once_and_leaves_nothing(tmp_path: Path, monkeypatch, capsy
         assert run["frames"] == 4
         assert 0 < run["first_tracked_s"] < run["process_s"]
         assert {"track", "map", "read"} <= set(run["stage_s"])
-    assert cold["compile_s"]["kernels"] == warm["compile_s"]["kernels"] > 10
+    assert cold["kernels"] == warm["kernels"] > 10
     assert cold["compile_s"]["compile"] > 3 * warm["compile_s"]["compile"], (
         "the second run finds the first one's kernels"
     )

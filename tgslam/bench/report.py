@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 from collections.abc import Iterable
 from importlib.metadata import version
@@ -18,10 +19,11 @@ _DIRECTIONS = ("forward", "backward")
 
 
 def machine() -> dict[str, Any]:
-    """Processor, threads and versions, for any figure to be read beside."""
+    """Processor, cores, versions, and how busy it is: what any figure is to be read beside."""
     return {
         "cpu": _cpu(),
         "cores": runtime.available_threads(),
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,  # processes wanting a core, last minute
         "system": platform.platform(),
         "python": platform.python_version(),
         "taichi": version("taichi"),
@@ -32,7 +34,8 @@ def machine() -> dict[str, Any]:
 
 def print_machine(found: dict[str, Any]) -> None:
     """One line."""
-    print(f"{found['cpu']}, {found['cores']} cores; Python {found['python']}, Taichi {found['taichi']}")
+    load = "" if found["load"] is None else f", load {found['load']:.1f} at the end"
+    print(f"{found['cpu']}, {found['cores']} cores{load}; Python {found['python']}, Taichi {found['taichi']}")
 
 
 def print_render(result: dict[str, Any]) -> None:
@@ -100,6 +103,7 @@ def print_run(result: dict[str, Any]) -> None:
     rows = [
         ("start of the process to first tracked frame, s", *_pair(cold, warm, "first_tracked_s")),
         ("whole process, s", *_pair(cold, warm, "process_s")),
+        ("kernels", str(cold["kernels"]), str(warm["kernels"])),
         ("frames/s", *_pair(cold, warm, "fps")),
         ("frames", str(cold["frames"]), str(warm["frames"])),
         ("keyframes", str(cold["keyframes"]), str(warm["keyframes"])),
@@ -108,10 +112,7 @@ def print_run(result: dict[str, Any]) -> None:
     ]
     for title, group in (("kernels", "compile_s"), ("stage", "stage_s")):
         names = dict.fromkeys([*cold[group], *warm[group]])
-        rows += [
-            (f"{title}: {name}{'' if name == 'kernels' else ', s'}", *_pair(cold[group], warm[group], name))
-            for name in names
-        ]
+        rows += [(f"{title}: {name}, s", *_pair(cold[group], warm[group], name)) for name in names]
     print_columns(f"tgslam run {' '.join(result['arguments'])}".rstrip(), ("kernel cache", *CACHES), rows)
 
 
@@ -185,9 +186,7 @@ def _pair(cold: dict[str, Any], warm: dict[str, Any], key: str) -> tuple[str, st
 
 
 def _number(value: float | None) -> str:
-    if value is None:
-        return "-"
-    return str(value) if isinstance(value, int) else f"{value:.2f}"
+    return "-" if value is None else f"{value:.2f}"
 
 
 def _cpu() -> str:

@@ -71,6 +71,7 @@ def _one_run(arguments: Sequence[str], kernels: Path, folder: Path) -> dict[str,
     return {
         "first_tracked_s": first_tracked_s,
         "process_s": process_s,
+        "kernels": compiling.pop("kernels"),
         "compile_s": compiling,
         **{name: metrics[name] for name in _METRICS},
     }

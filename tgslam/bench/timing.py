@@ -11,6 +11,8 @@ import numpy as np
 from tgslam import runtime
 from tgslam.stopwatch import Stopwatch
 
+REST = "rest"  # what the stages leave of the whole
+
 
 class Samples:
     """Repetitions of one piece of work whose stages a stopwatch times."""
@@ -42,10 +44,10 @@ class Samples:
     def __len__(self) -> int:
         return len(self._total_s)
 
-    def report(self, rest: str = "rest") -> dict[str, Any]:
+    def report(self, rest: str = REST) -> dict[str, Any]:
         """`ms` of the whole, `stages_ms`, and each stage's `share` of the whole over all samples.
 
-        rest: name of what the stages leave of the whole.
+        rest: the name for what the stages leave of the whole.
         """
         stages = list(dict.fromkeys(name for sample in self._stage_s for name in sample))
         stage_s = {name: [sample.get(name, 0.0) for sample in self._stage_s] for name in stages}
