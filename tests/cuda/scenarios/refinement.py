@@ -1,0 +1,58 @@
+"""Iterations of mapping: render, compare, differentiate, move the map and a keyframe's pose."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tests.cuda.harness import scenario
+from tgslam.config.schema import LossConfig, MappingConfig, SyntheticConfig
+from tgslam.datasets.synthetic import SyntheticSource
+from tgslam.gaussian_map import PARAMETERS, GaussianMap
+from tgslam.geometry import se3_exp
+from tgslam.mapping.keyframe import Keyframe
+from tgslam.mapping.refinement import Refiner
+from tgslam.tracking.exposure import Exposure
+from tgslam.types import Camera, Frame, Gaussians
+
+_GRID = (40, 30)  # Gaussians in a row, rows
+
+
+def _facing(frame: Frame, camera: Camera) -> Gaussians:
+    """Gaussians on the surface that a frame sees, a little too dark, and some more behind the camera."""
+    columns, rows = np.linspace(1, camera.width - 2, _GRID[0]), np.linspace(1, camera.height - 2, _GRID[1])
+    u, v = (pixel.ravel() for pixel in np.meshgrid(columns, rows))
+    at = v.astype(int), u.astype(int)
+    z = np.where(frame.depth_m[at] > 0, frame.depth_m[at], 2.0)
+    mean = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], 1) * z[:, None]
+    mean[::9] *= -1.0
+    n, size = len(z), z * camera.width / _GRID[0] / camera.fx
+    rng = np.random.default_rng(0)
+    return Gaussians(
+        mean=mean.astype(np.float32),
+        log_scale=np.log(size[:, None] * [0.6, 0.6, 0.1]).astype(np.float32),
+        quat_wxyz=(np.float32([1, 0, 0, 0]) + 0.1 * rng.normal(size=(n, 4))).astype(np.float32),
+        opacity_logit=np.full(n, 2.0, np.float32),
+        colour=0.8 * frame.colour[at],
+        embedding=np.zeros((n, 3), np.float32),
+        plane_id=np.full(n, -1, np.int32),
+        birth_keyframe=np.zeros(n, np.int32),
+    )
+
+
+@scenario
+def steps(optimizer: str = "relaxation", steps: int = 3) -> dict[str, np.ndarray]:
+    """The map, the pose, the losses and the record of the views after some steps on one keyframe."""
+    source = SyntheticSource(SyntheticConfig(scene="room", width=64, height=48, frames=720), seed=0)
+    frame = source.read(0)
+    gaussians = GaussianMap.from_gaussians(_facing(frame, source.camera))
+    refiner = Refiner(source.camera, MappingConfig(optimizer=optimizer), LossConfig())
+    refiner.append(gaussians.count)
+    pose = se3_exp([0.002, -0.001, 0.001, 0.003, 0.002, -0.004])
+    keyframe = Keyframe.from_frame(frame, pose, Exposure(1.1, 0.02), np.eye(6))
+    values = [refiner.step(gaussians, keyframe, move_pose=True).value for _ in range(steps)]
+    return {name: gaussians.host(name).copy() for name in PARAMETERS} | {
+        "pose": keyframe.T_cw,
+        "values": np.array(values),
+        "contribution": refiner.contribution.copy(),
+        "views": refiner.views.copy(),
+    }
