@@ -1,4 +1,4 @@
-"""What one view says of planes. Plane: n . x + d = 0 with |n| = 1, n towards the camera, so d > 0 in the camera frame."""
+"""What one view says of planes: n . x + d = 0 with |n| = 1, n towards the camera, so d > 0 in the camera frame."""
 
 from __future__ import annotations
 
