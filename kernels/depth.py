@@ -1,4 +1,4 @@
-"""Depth images: measurements that no neighbour supports."""
+"""Depth images: how many measurements there are, and which no neighbour supports."""
 
 import taichi as ti
 
@@ -31,3 +31,17 @@ def keep_supported(
                         other = depth[yy, xx]
                         count += ti.select(other > 0.0 and ti.abs(other - z) < tolerance, 1, 0)
             kept[y, x] = ti.select(z > 0.0 and count >= min_neighbours, z, 0.0)
+
+
+@ti.kernel
+def count_measured(
+    depth: nd(ti.f32, ndim=2),  # [H, W] m, 0 = none
+    counts: nd(ti.i32, ndim=1),  # [H * SPLIT] out: of each segment of a row
+):
+    """Count the measurements."""
+    for s in range(depth.shape[0] * SPLIT):
+        y, begin, end = segment(s, depth.shape[1])
+        count = 0
+        for x in range(begin, end):
+            count += ti.select(depth[y, x] > 0.0, 1, 0)
+        counts[s] = count

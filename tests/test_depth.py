@@ -72,6 +72,13 @@ def test_a_nan_measurement_is_dropped():
     assert kept[4, 4] == 0 and np.count_nonzero(kept) == 80
 
 
+@pytest.mark.parametrize("size", [(24, 32), (1, 1), (150, 7)])
+def test_the_measured_share_counts_every_pixel(size):
+    depth_m = ragged(*size)
+    assert depth.measured_share(runtime.to_device(depth_m)) == np.count_nonzero(depth_m) / depth_m.size
+    assert depth.measured_share(runtime.zeros(size)) == 0.0
+
+
 def test_wrong_shapes_are_refused():
     with pytest.raises(ValueError, match="depth_m"):
         depth.without_flying_pixels(np.zeros((2, 3, 4), np.float32), SIGMA, 100.0)

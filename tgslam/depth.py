@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from tgslam import runtime
 from tgslam.arrays import require
 from tgslam.kernels import depth as kernels
+from tgslam.kernels.image import SPLIT
 
 _TOLERANCE_SIGMAS = 4.2  # three sigma of a difference of two measurements
 _STEEPEST = 5.7  # tangent of 80 degrees
@@ -24,6 +25,14 @@ def without_flying_pixels(depth_m: np.ndarray, sigma_per_m2: float, focal_px: fl
     kept = runtime.empty(depth_m.shape)
     kernels.keep_supported(depth_m, sigma_per_m2, _TOLERANCE_SIGMAS, _STEEPEST / focal_px, _MIN_NEIGHBOURS, kept)
     return kept
+
+
+def measured_share(depth_m: np.ndarray) -> float:
+    """Which part of the pixels of float32 [H, W] in m, 0 = none, hold a measurement."""
+    height, width = require("depth_m", depth_m, (None, None)).shape
+    counts = runtime.empty((height * SPLIT,), np.int32)
+    kernels.count_measured(depth_m, counts)
+    return int(runtime.to_host(counts).sum()) / (height * width)
 
 
 def filled(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam import images, runtime
 from tgslam.config.schema import KeyframeConfig
 from tgslam.geometry import inverse
 from tgslam.types import Frame
@@ -29,7 +30,7 @@ class KeyframeSelector:
     def cue(self, frame: Frame, T_cw: NDArray[np.float64], seen: NDArray[np.bool_], unexplained: float) -> str:
         """Why the frame, tracked at T_cw [4, 4], should be a keyframe, "" if it should not.
 
-        seen: [N] Gaussians in the frame's view. unexplained: share of the frame's pixels that the map leaves open.
+        Its depth may lie on the host or on the device. seen: [N] Gaussians in the frame's view. unexplained: share of the frame's pixels that the map leaves open.
         """
         union = int((seen | self._seen).sum())
         overlap = int((seen & self._seen).sum()) / max(union, 1)
@@ -38,8 +39,15 @@ class KeyframeSelector:
         if unexplained > self.config.max_unexplained:
             return f"co-visibility: {unexplained:.0%} of the frame is not in the map"
         moved_m = float(np.linalg.norm(inverse(T_cw)[:3, 3] - inverse(self._T_cw)[:3, 3]))
-        if moved_m > self.config.max_translation * float(np.median(frame.depth_m[frame.depth_m > 0])):
+        if moved_m > self.config.max_translation * _median_depth_m(frame):
             return f"baseline: {moved_m:.2f} m"
         if frame.index - self._last_index >= self.config.max_interval:
             return "interval"
         return ""
+
+
+def _median_depth_m(frame: Frame) -> float:
+    """Of a grid of the frame's measurements; infinite where it meets none."""
+    depth_m = images.sampled(runtime.to_device(frame.depth_m))
+    measured = depth_m[depth_m > 0]
+    return float(np.median(measured)) if len(measured) else np.inf

@@ -98,7 +98,12 @@ def zeros(shape: tuple[int, ...], dtype: type = np.float32, *, lanes: bool = Fal
 
 
 def to_device(array: ArrayLike, dtype: type = np.float32) -> np.ndarray:
-    """A host array as a device array: no copy on the CPU if it is contiguous and of that dtype already."""
+    """A host array as a device array: no copy on the CPU if it is contiguous and of that dtype already.
+
+    An array that is on the device comes back as it is.
+    """
+    if isinstance(array, ti.Ndarray):
+        return array
     host: np.ndarray = np.ascontiguousarray(array, dtype)
     if device() is Device.CPU:
         return host

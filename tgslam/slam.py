@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tgslam import runtime
 from tgslam.config.schema import Config
-from tgslam.depth import without_flying_pixels
+from tgslam.depth import measured_share, without_flying_pixels
 from tgslam.errors import FrameError
 from tgslam.geometry import inverse, orthonormalized
 from tgslam.keyframes import KeyframeSelector
@@ -132,15 +132,14 @@ class Slam:
             self.exposure = result.exposure
 
     def _prepared(self, frame: Frame) -> Frame:
-        """The frame without flying pixels. Raises FrameError for a frame that cannot be used."""
+        """The frame without flying pixels, as device arrays. Raises FrameError for a frame that cannot be used."""
         size = (self.camera.height, self.camera.width)
         if frame.depth_m.shape != size or frame.colour.shape != (*size, 3):
             raise FrameError(f"frame {frame.index}: images of {frame.depth_m.shape} do not fit the camera's {size}")
         depth_m = without_flying_pixels(runtime.to_device(frame.depth_m), self.sigma_per_m2, self.camera.fx)
-        frame = replace(frame, depth_m=runtime.to_host(depth_m))
-        if (frame.depth_m > 0).mean() < _MIN_DEPTH_SHARE:
+        if measured_share(depth_m) < _MIN_DEPTH_SHARE:
             raise FrameError(f"frame {frame.index}: depth in less than {_MIN_DEPTH_SHARE:.0%} of its pixels")
-        return frame
+        return replace(frame, colour=runtime.to_device(frame.colour), depth_m=depth_m)
 
     @contextmanager
     def _stage(self, name: str) -> Iterator[None]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam import runtime
 from tgslam.tracking.exposure import Exposure
 from tgslam.types import Frame
 
@@ -29,10 +30,10 @@ class Keyframe:
     def from_frame(
         cls, frame: Frame, T_cw: NDArray[np.float64], exposure: Exposure, information: NDArray[np.float64]
     ) -> Keyframe:
-        """Keep a frame with its tracked pose."""
-        colour = np.rint(frame.colour * 255.0).astype(np.uint8)
+        """Keep a frame (its images on the host or on the device) with its tracked pose."""
+        colour = np.rint(runtime.to_host(frame.colour) * 255.0).astype(np.uint8)
         limit = np.iinfo(np.uint16).max
-        units = np.rint(frame.depth_m / _DEPTH_UNIT_M)
+        units = np.rint(runtime.to_host(frame.depth_m) / _DEPTH_UNIT_M)
         depth = np.where(units <= limit, units, 0).astype(np.uint16)
         return cls(frame.index, frame.timestamp_s, T_cw, exposure, information, colour, depth)
 
