@@ -30,7 +30,8 @@ class KeyframeSelector:
     def cue(self, frame: Frame, T_cw: NDArray[np.float64], seen: NDArray[np.bool_], unexplained: float) -> str:
         """Why the frame, tracked at T_cw [4, 4], should be a keyframe, "" if it should not.
 
-        Its depth may lie on the host or on the device. seen: [N] Gaussians in the frame's view. unexplained: share of the frame's pixels that the map leaves open.
+        The frame's depth may lie on the host or on the device. seen: [N] Gaussians in the frame's view. unexplained:
+        share of the frame's pixels that the map leaves open.
         """
         union = int((seen | self._seen).sum())
         overlap = int((seen & self._seen).sum()) / max(union, 1)
