@@ -4,32 +4,36 @@ from __future__ import annotations
 
 import time
 
-import numpy as np
-
 from tgslam import runtime
 from tgslam.kernels import peak
 
 _PARTS_PER_THREAD = 4
 _LAUNCH_S = 0.01  # long enough that starting the threads does not show, short enough to be left alone now and then
-_LAUNCHES = 20
 
 
-def multiply_add_gflops(threads: int) -> float:
-    """10^9 additions and multiplications a second, the best of several launches.
+class MultiplyAdd:
+    """Samples of the throughput, to be taken between those of the work that is compared with it.
 
-    It is what Taichi gets out of this machine with everything in registers, not what the data sheet promises.
+    The most counts. It is what Taichi gets out of this machine with everything in registers, not what the data sheet
+    promises.
     """
-    x = runtime.zeros((_PARTS_PER_THREAD * threads, peak.CHAINS, peak.LANES), lanes=True)
-    _launch_s(x, 1)  # compiles
-    steps = 1000
-    while _launch_s(x, steps) < _LAUNCH_S:
-        steps *= 2
-    best_s = min(_launch_s(x, steps) for _ in range(_LAUNCHES))
-    return peak.FLOPS_PER_STEP * steps * x.shape[0] / best_s / 1e9
 
+    def __init__(self, threads: int) -> None:
+        """threads: that the kernels run on."""
+        self.gflops = 0.0  # 10^9 additions and multiplications a second
+        self._x = runtime.zeros((_PARTS_PER_THREAD * threads, peak.CHAINS, peak.LANES), lanes=True)
+        self._steps = 1
+        self._launch_s()  # compiles
+        while self._launch_s() < _LAUNCH_S:
+            self._steps *= 2
 
-def _launch_s(x: np.ndarray, steps: int) -> float:
-    start = time.perf_counter()
-    peak.multiply_add(steps, 0.5, 0.25, x)
-    runtime.wait()
-    return time.perf_counter() - start
+    def sample(self) -> None:
+        """Measure once more."""
+        flops = peak.FLOPS_PER_STEP * self._steps * self._x.shape[0]
+        self.gflops = max(self.gflops, flops / self._launch_s() / 1e9)
+
+    def _launch_s(self) -> float:
+        start = time.perf_counter()
+        peak.multiply_add(self._steps, 0.5, 0.25, self._x)
+        runtime.wait()
+        return time.perf_counter() - start

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from tgslam.bench import arithmetic, scenes
-from tgslam.bench.peak import multiply_add_gflops
+from tgslam.bench.peak import MultiplyAdd
 from tgslam.bench.scenes import Scene
 from tgslam.bench.timing import REST, Samples
 from tgslam.gaussian_map import GaussianMap, MapGradient
@@ -63,17 +63,16 @@ def run(
 ) -> dict[str, Any]:
     """Measure every scene on its own. threads: that the kernels run on, for the peak. step: told of each scene.
 
-    Scenes are made one at a time, when their turn comes. The peak is measured with each of them, and the most counts.
+    Scenes are made one at a time, when their turn comes. The peak is sampled in every round.
     """
-    peak_gflops, cases = 0.0, []
+    peak, cases = MultiplyAdd(threads), []
     for make in case_scenes:
         scene = make()
         step(f"{scene.name} {scene.camera.width}x{scene.camera.height}, {len(scene.gaussians):,} Gaussians")
-        cases.append(measured_together([scene], repeats)[0])
-        peak_gflops = max(peak_gflops, multiply_add_gflops(threads))
+        cases += measured_together([scene], repeats, peak.sample)
     for case in cases:
-        _compare_with_peak(case, peak_gflops)
-    return {"threads": threads, "peak_gflops": peak_gflops, "cases": cases}
+        _compare_with_peak(case, peak.gflops)
+    return {"threads": threads, "peak_gflops": peak.gflops, "cases": cases}
 
 
 def linearity(width: int, height: int, count: int, repeats: int) -> list[dict[str, Any]]:
@@ -92,8 +91,10 @@ def linearity(width: int, height: int, count: int, repeats: int) -> list[dict[st
     return [_change(name, reference, other) for name, other in zip(names, others, strict=True)]
 
 
-def measured_together(together: Sequence[Scene], repeats: int) -> list[dict[str, Any]]:
-    """Reports of scenes that take turns, after warming up."""
+def measured_together(
+    together: Sequence[Scene], repeats: int, between: Callable[[], object] = lambda: None
+) -> list[dict[str, Any]]:
+    """Reports of scenes that take turns, after warming up. between: done once a round."""
     cases = [Case(scene) for scene in together]
     for number in range(WARM_UP + repeats):
         for case in cases:
@@ -101,6 +102,7 @@ def measured_together(together: Sequence[Scene], repeats: int) -> list[dict[str,
                 for samples in case.samples.values():
                     samples.clear()
             case.round()
+        between()
     return [case.report() for case in cases]
 
 
