@@ -180,6 +180,34 @@ def test_repeats_bit_for_bit_and_with_a_used_workspace():
         np.testing.assert_array_equal(runtime.to_host(getattr(again, name)), runtime.to_host(getattr(fresh, name)))
 
 
+def test_numbers_that_were_read_outlive_the_workspace():
+    rendering, observed = scene(33, 48)
+    workspace = losses.Workspace(33, 48)
+    first, _ = evaluate(rendering, observed, workspace=workspace)
+    before = first.value, first.g_gain, first.g_bias
+    other, _ = evaluate(scene(33, 48, seed=5)[0], observed, workspace=workspace)
+    assert (first.value, first.g_gain, first.g_bias) == before
+    assert other.value != first.value and other.g_gain != first.g_gain
+
+
+def test_images_anywhere_in_memory_give_the_same():
+    """Kernels load whole vectors, in place where an image begins at a multiple of 64 bytes."""
+    rendering, observed = scene(33, 48)
+    found, _ = evaluate([at_offset(a, 0) for a in rendering], [at_offset(a, 0) for a in observed])
+    moved, _ = evaluate([at_offset(a, 4) for a in rendering], [at_offset(a, 4) for a in observed])
+    assert moved.value == found.value
+    for name in ("g_colour", "g_depth", "g_opacity", "w_colour", "w_depth"):
+        np.testing.assert_array_equal(getattr(moved, name), getattr(found, name))
+
+
+def at_offset(image, offset_bytes):
+    """A float32 copy that begins at a multiple of 64 bytes plus an offset."""
+    memory = runtime.empty((image.size + 16,)).view(np.uint8)
+    copy = memory[offset_bytes : offset_bytes + 4 * image.size].view(np.float32).reshape(image.shape)
+    copy[:] = image
+    return copy
+
+
 def test_the_gate_moves_weight_from_colour_to_depth():
     rendering, observed = scene(40, 48, masked=False)
     plain = replace(CONFIG, gate_depth_boost=0.0)

@@ -15,7 +15,9 @@ from tgslam.evaluation.images import psnr
 from tgslam.geometry import inverse, se3_exp, se3_log, transform_points
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.mapper import Mapper
+from tgslam.mapping.refinement import Refiner
 from tgslam.render import Rasterizer
+from tgslam.stopwatch import Stopwatch
 from tgslam.synthetic import sensor
 from tgslam.tracking.exposure import Exposure
 from tgslam.types import Frame, Gaussians, Rendering
@@ -252,6 +254,18 @@ def test_refinement_lowers_the_loss_and_raises_the_psnr(source: SyntheticSource,
     assert losses[5] < 0.9 * losses[0]
     assert losses[-1] < 0.65 * losses[0]
     assert psnr(view(mapper, np.eye(4)).colour, source.clean(0).colour) > before_db + 4.0
+
+
+def test_a_stopwatch_takes_the_stages_of_an_iteration(source: SyntheticSource) -> None:
+    mapper = make_mapper(source, iterations=0)
+    first = keyframe(source, source.read(0))
+    mapper.add_keyframe(first)
+    stopwatch = Stopwatch()
+    refiner = Refiner(source.camera, mapper.config, mapper.loss, stopwatch)
+    refiner.append(mapper.gaussians.count)
+    refiner.step(mapper.gaussians, first, move_pose=False)
+    assert list(stopwatch.seconds) == ["forward", "loss", "backward", "update"]
+    assert all(seconds > 0 for seconds in stopwatch.seconds.values())
 
 
 @pytest.mark.parametrize("optimizer", ["relaxation", "adam"])
