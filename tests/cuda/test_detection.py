@@ -53,9 +53,9 @@ def test_enough_blocks_hide_a_missing_last_barrier(own_devices: Devices) -> None
     np.testing.assert_array_equal(own_devices.cuda(broken.no_last_barrier)["y"], blocks[:, ::-1].ravel())
 
 
-def test_an_index_below_zero_is_reported_when_reversed(own_devices: Devices) -> None:
+def test_an_index_below_zero_is_reported(own_devices: Devices) -> None:
     with pytest.raises(ScenarioError, match=r"(?m)^cudastub: .*illegal address"):
-        own_devices.cuda(broken.outside_array, Grid.REVERSED, offset=-1)
+        own_devices.cuda(broken.outside_array, offset=-1)
 
 
 def test_a_crash_or_an_exception_is_that_scenarios_alone(own_devices: Devices) -> None:

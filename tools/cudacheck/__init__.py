@@ -10,8 +10,8 @@ shared memory that was not written, divergent barriers, warp operations with lan
 addresses outside every allocation, launches that no GPU accepts.
 
 What it cannot show: races between blocks (blocks run one after another; the grid modes `single` and `reversed` only
-change their order), accesses that stray into another part of the same allocation, the rounding of a GPU's approximate
-functions (exp2, sin, rsqrt, ... are exact here), and time.
+change their order), accesses that stray within an array's last page (of 4096 bytes), the rounding of a GPU's
+approximate functions (exp2, sin, rsqrt, ... are exact here), and time.
 
 x86-64 Linux with gcc; `ptxas` for the report. `python -m tools.cudacheck --help` is the command.
 """

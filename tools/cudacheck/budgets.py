@@ -91,7 +91,7 @@ def violations(rows: Iterable[Usage], budgets: Budgets) -> list[str]:
 def table(rows: Iterable[Usage], budgets: Budgets | None = None) -> str:
     """The rows as text; with budgets, the allowed figure follows each."""
     heads = ("kernel", "arch", "registers", "shared", "stack", "spills")
-    cells = [heads]
+    cells: list[tuple[str, ...]] = [heads]
     for row in rows:
         budget = (budgets or {}).get(row.kernel)
         limits = (budget.registers, budget.shared_bytes, budget.stack_bytes) if budget else (None,) * 3

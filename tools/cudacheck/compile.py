@@ -21,7 +21,18 @@ def compile_ptx(ptx: Path, library: Path) -> None:
     """Translate a PTX file and build a shared library; nobody ever sees half of it. Raises CudaCheckError."""
     stem = f"{library.stem}.{os.getpid()}"
     source, unfinished = library.with_name(f"{stem}.c"), library.with_name(f"{stem}.so")
-    command = ["gcc", "-std=gnu11", *FLAGS, f"-I{NATIVE}", "-shared", "-fPIC", "-o", unfinished, source, "-lm"]
+    command = [
+        "gcc",
+        "-std=gnu11",
+        *FLAGS,
+        f"-I{NATIVE}",
+        "-shared",
+        "-fPIC",
+        "-o",
+        str(unfinished),
+        str(source),
+        "-lm",
+    ]
     try:
         source.write_text(translate(ptx.read_text()))
         done = subprocess.run(command, capture_output=True, text=True, check=False)

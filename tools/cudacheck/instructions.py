@@ -317,10 +317,14 @@ def _convert(i: Instruction, context: Context) -> str:
 
 
 def _test_property(i: Instruction, context: Context) -> str:
-    function = {"finite": "isfinite", "infinite": "isinf", "notanumber": "isnan", "number": "!isnan"}[i.modifiers[0]]
-    return f"{context.register(i.operands[0])} = !!{function}({_typed(i.type, i.operands[1], context)});".replace(
-        "!!!", "!"
-    )
+    value = _typed(i.type, i.operands[1], context)
+    test = {
+        "finite": f"isfinite({value}) != 0",
+        "infinite": f"isinf({value}) != 0",
+        "notanumber": f"isnan({value}) != 0",
+        "number": f"isnan({value}) == 0",
+    }[i.modifiers[0]]
+    return f"{context.register(i.operands[0])} = {test};"
 
 
 # ---- memory ----------------------------------------------------------------

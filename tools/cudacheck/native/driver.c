@@ -44,8 +44,8 @@ static void log_line(const char *format, ...) {
 // ---- device memory ---------------------------------------------------------
 
 // One reserved range of addresses, none of them used twice, an inaccessible page between any two allocations: a kernel
-// that runs past an array's end, or uses one that was freed, faults instead of reading its neighbour. Arrays end at
-// that page; with CUDACHECK_REVERSED they begin after one, so that indices below 0 fault as well.
+// that runs past an array's ends, or uses one that was freed, faults instead of reading its neighbour. (Taichi rounds
+// its arrays up to whole pages: what strays by less than that remainder is not seen.)
 #define RANGE (1ULL << 38)
 enum { PAGE = 4096, ALIGNMENT = 16, POISON_LIMIT = 64 << 20, UNINITIALISED = 0xFF };
 
@@ -69,8 +69,8 @@ static void remember(Allocation allocation) {
 }
 
 static u32 allocate(void **out, size_t bytes) {
-    size_t used = (bytes + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT, pages = (used / PAGE + 1) * PAGE;
-    if (used && used % PAGE == 0) pages -= PAGE;
+    if (!bytes) bytes = 1;
+    size_t used = (bytes + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT, pages = (used + PAGE - 1) / PAGE * PAGE;
     u32 status = SUCCESS;
     pthread_mutex_lock(&mutex);
     if (!range_start) {
@@ -82,7 +82,7 @@ static u32 allocate(void **out, size_t bytes) {
                     mprotect(range_used, pages, PROT_READ | PROT_WRITE)))
         status = OUT_OF_MEMORY;
     if (!status) {
-        u8 *start = setting("CUDACHECK_REVERSED", 0) ? range_used : range_used + pages - used;
+        u8 *start = range_used + pages - used;  // so that the end lies at the inaccessible page
         remember((Allocation){start, range_used, pages});
         if (bytes < POISON_LIMIT) memset(range_used, UNINITIALISED, pages);  // a GPU's memory is not zero either
         range_used += pages + PAGE;

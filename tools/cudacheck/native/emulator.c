@@ -215,7 +215,7 @@ typedef struct {
     u32 write_epoch, read_epoch;
     u32 write_turn, read_turn;  // warp barriers that the warp had passed by then
     int writer, reader;
-    int atomic;  // the last write was an atomic operation
+    int atomic;  // all writes of its epoch were atomic operations
 } Cell;
 
 static Cell cells[ARENA_BYTES];
@@ -261,10 +261,10 @@ static void touch(Cell *cell, int thread, SharedAccess kind, int line, long offs
     }
     if (writes) {
         cell->block = block_serial;
+        cell->atomic = is_atomic && (cell->write_epoch != epoch || cell->atomic);
         cell->write_epoch = epoch;
         cell->write_turn = warp_turn[thread / WARP];
         cell->writer = thread;
-        cell->atomic = is_atomic;
     } else {
         cell->reader = cell->read_epoch == epoch ? reader_joined(cell->reader, thread) : thread;
         cell->read_epoch = epoch;
