@@ -1,9 +1,9 @@
 """Tile rasterizer for CUDA: a block a tile, a pixel a thread, and 8x4 pixels a warp.
 
 Splats are sorted by depth first (stably, so that equal depths go by index); each is then listed once for every tile it
-touches, and a stable sort of that list by tile leaves every tile's splats in depth order. A block fetches its list in
-batches. Whoever fetches a splat also finds out which warps it reaches, and a warp walks through the bits of its ballot
-over them: splats elsewhere in the tile cost it next to nothing.
+touches, and a stable sort of that list by tile leaves every tile's splats in depth order. For each (splat, tile) slot,
+`find_reach` tells which of the tile's warps the splat reaches. A block fetches its slots in batches, and a warp walks
+through the bits of its ballot over those that reach it: splats elsewhere in the tile cost it next to nothing.
 """
 
 import taichi as ti
@@ -11,7 +11,7 @@ import taichi as ti
 from tgslam.kernels.blending import least_exponent, raw_alpha, tangent_depth
 from tgslam.kernels.cuda.block import BLOCK, WARPS
 from tgslam.kernels.cuda.warp import ALL, WARP, sums_of_4, sums_of_16
-from tgslam.kernels.projection import EMBEDDING, FADE, INV_Z, M_EMBEDDING, QA, QB, QC, RED, ZU, ZV, U, V, Z
+from tgslam.kernels.projection import EMBEDDING, FADE, INV_Z, M_EMBEDDING, QA, QB, QC, RED, SPLAT, ZU, ZV, U, V, Z
 from tgslam.kernels.simd import ALPHA_MAX, ALPHA_MIN, REACH, T_MIN, TILE
 
 nd = ti.types.ndarray
@@ -20,9 +20,7 @@ DEPTH_BITS = 31  # of a positive float
 NOWHERE = 0x7FFFFFFF  # depth key of a Gaussian that is not drawn: behind all others
 PART_X, PART_Y = 8, 4  # px of a warp's part of a tile
 PARTS_X = TILE // PART_X
-# Columns of a batch in shared memory: those of a splat row up to the colour, then:
-S_INV_Z, S_EMBEDDING = 12, 13
-COLUMNS, COLUMNS_EMBEDDING = 13, 16
+FETCHED = 8  # values that a thread fetches at a time
 
 
 @ti.kernel
@@ -94,13 +92,6 @@ def find_starts(
 
 
 @ti.func
-def pixel_of(thread):
-    """Pixel of a thread in its tile."""
-    warp, lane = thread // WARP, thread % WARP
-    return (warp % PARTS_X) * PART_X + lane % PART_X, warp // PARTS_X * PART_Y + lane // PART_X
-
-
-@ti.func
 def warps_reached(u, v, a, b, c, fade):
     """Bit w = the splat has alpha >= ALPHA_MIN somewhere in warp w's part of the tile; (u, v) relative to the tile."""
     reach = (REACH - fade) * 1.0001 + 1e-5  # rounding may not lose a pixel
@@ -112,35 +103,57 @@ def warps_reached(u, v, a, b, c, fade):
     return mask
 
 
-@ti.func
-def fetch(
-    k,
-    x0,
-    y0,
-    thread,
-    ids: ti.template(),
-    splat: ti.template(),
-    with_embedding: ti.template(),
-    batch: ti.template(),
-    reached: ti.template(),
+@ti.kernel
+def find_reach(
+    slots: ti.i32,
+    tiles_x: ti.i32,
+    tile: nd(ti.i32, ndim=1),  # [slots]
+    ids: nd(ti.i32, ndim=1),  # [slots]
+    splat: nd(ti.f32, ndim=2),  # [N, SPLAT]
+    reached: nd(ti.i32, ndim=1),  # [slots] out: bit w = the splat reaches warp w's part of the tile
 ):
-    """Put the splat of slot k into the batch, its centre relative to the tile at (x0, y0)."""
-    i = ids[k]
-    u, v = splat[i, U] - x0, splat[i, V] - y0
-    batch[U, thread], batch[V, thread] = u, v
-    for c in ti.static(range(QA, RED + 3)):
-        batch[c, thread] = splat[i, c]
-    batch[S_INV_Z, thread] = splat[i, INV_Z]
-    if ti.static(with_embedding):
-        for c in ti.static(range(3)):
-            batch[S_EMBEDDING + c, thread] = splat[i, EMBEDDING + c]
-    reached[thread] = warps_reached(u, v, splat[i, QA], splat[i, QB], splat[i, QC], splat[i, FADE])
+    """Which warps have to look at a slot."""
+    for slot in range(slots):
+        i = ids[slot]
+        u, v = splat[i, U] - tile[slot] % tiles_x * TILE, splat[i, V] - tile[slot] // tiles_x * TILE
+        reached[slot] = warps_reached(u, v, splat[i, QA], splat[i, QB], splat[i, QC], splat[i, FADE])
+
+
+@ti.func
+def pixel_of(tile, tiles_x, warp, lane):
+    """Column and row of a thread's pixel."""
+    x = tile % tiles_x * TILE + warp % PARTS_X * PART_X + lane % PART_X
+    y = tile // tiles_x * TILE + warp // PARTS_X * PART_Y + lane // PART_X
+    return x, y
+
+
+@ti.func
+def fetch(first, end, thread, ids: ti.template(), splat: ti.template(), batch: ti.template()):
+    """Copy the splat rows of slots [first, end), BLOCK at most, into the batch; returns the thread's own Gaussian.
+
+    Each warp copies 32 rows, a row by 16 lanes, so that memory is read in long pieces. Values are read in groups
+    before any is written: the compiler would wait for each one alone, since for all it knows the arrays overlap. And
+    the lane's number goes through a shuffle, so that the compiler does not take it for the same in every batch; it
+    would keep all addresses in registers (forward 72 instead of 64 at most, backward 86).
+    """
+    lane = ti.simt.warp.shfl_sync_i32(ti.u32(ALL), thread, thread) & (WARP - 1)
+    upper = lane >> 4
+    row, column = thread >> 5 << 5 | upper, lane & (SPLAT - 1)
+    i = ids[ti.min(first + thread, end - 1)]
+    for group in ti.static(range(0, WARP, 2 * FETCHED)):
+        values = ti.Vector([0.0] * FETCHED)
+        for k in ti.static(range(FETCHED)):
+            source = ti.simt.warp.shfl_sync_i32(ti.u32(ALL), i, group + 2 * k + upper)
+            values[k] = splat[source, column]
+        for k in ti.static(range(FETCHED)):
+            batch[row | group + 2 * k, column] = values[k]
+    return i
 
 
 @ti.func
 def alpha_before_cap(dx, dy, j, batch: ti.template()):
     """The j-th splat's alpha at an offset from its centre, neither capped nor cut."""
-    return raw_alpha(dx, dy, batch[QA, j], batch[QB, j], batch[QC, j], batch[FADE, j])
+    return raw_alpha(dx, dy, batch[j, QA], batch[j, QB], batch[j, QC], batch[j, FADE])
 
 
 @ti.func
@@ -155,6 +168,7 @@ def forward(
     tiles_x: ti.i32,
     start: nd(ti.i32, ndim=1),  # [tiles + 1]
     ids: nd(ti.i32, ndim=1),  # [slots]
+    reached: nd(ti.i32, ndim=1),  # [slots] of `find_reach`
     splat: nd(ti.f32, ndim=2),  # [N, SPLAT]
     with_embedding: ti.template(),
     stop: nd(ti.i32, ndim=2),  # [tiles, WARPS] out: slot behind the last one that a warp blended
@@ -166,14 +180,13 @@ def forward(
     """Alpha blending front to back; a warp ends when all of its pixels let less than T_MIN through."""
     ti.loop_config(block_dim=BLOCK)
     for i in range(tiles * BLOCK):
-        batch = ti.simt.block.SharedArray((ti.static(COLUMNS_EMBEDDING if with_embedding else COLUMNS), BLOCK), ti.f32)
-        reached = ti.simt.block.SharedArray((BLOCK,), ti.i32)
+        batch = ti.simt.block.SharedArray((BLOCK, SPLAT), ti.f32)
+        warps = ti.simt.block.SharedArray((BLOCK,), ti.i32)  # those that each splat of the batch reaches
         tile, thread = i // BLOCK, i % BLOCK
         warp, lane = thread // WARP, thread % WARP
-        x0, y0 = (tile % tiles_x) * TILE, tile // tiles_x * TILE
-        x, y = pixel_of(thread)
+        x, y = pixel_of(tile, tiles_x, warp, lane)
         px, py = ti.cast(x, ti.f32), ti.cast(y, ti.f32)
-        inside = x0 + x < depth.shape[1] and y0 + y < depth.shape[0]
+        inside = x < depth.shape[1] and y < depth.shape[0]
         T = ti.select(inside, 1.0, 0.0)
         r, g, b, d, e0, e1, e2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         first, end = start[tile], start[tile + 1]
@@ -181,30 +194,31 @@ def forward(
         is_open = 1
         any_open = ti.cast(first < end, ti.i32)
         while any_open != 0:
-            reached[thread] = 0
+            fetch(first, end, thread, ids, splat, batch)
+            warps[thread] = 0
             if first + thread < end:
-                fetch(first + thread, x0, y0, thread, ids, splat, with_embedding, batch, reached)
+                warps[thread] = reached[first + thread]
             ti.simt.block.sync()
             word = 0
             while word < BLOCK and is_open != 0:
-                bits = ti.simt.warp.ballot((reached[word + lane] >> warp) & 1)
+                bits = ti.simt.warp.ballot((warps[word + lane] >> warp) & 1)
                 while bits != 0:
-                    j = word + lowest_bit(bits)
+                    j = (word + lowest_bit(bits)) & (BLOCK - 1)  # seen to be less than BLOCK: cheap addresses
                     bits &= bits - 1
-                    dx, dy = px - batch[U, j], py - batch[V, j]
+                    dx, dy = px - batch[j, U], py - batch[j, V]
                     alpha = ti.min(alpha_before_cap(dx, dy, j, batch), ALPHA_MAX)
                     if alpha > ALPHA_MIN:
                         w = T * alpha
                         T -= w
-                        r += w * batch[RED, j]
-                        g += w * batch[RED + 1, j]
-                        b += w * batch[RED + 2, j]
-                        step = batch[ZU, j] * dx + batch[ZV, j] * dy
-                        d += w * tangent_depth(step, batch[Z, j], batch[S_INV_Z, j])
+                        r += w * batch[j, RED]
+                        g += w * batch[j, RED + 1]
+                        b += w * batch[j, RED + 2]
+                        step = batch[j, ZU] * dx + batch[j, ZV] * dy
+                        d += w * tangent_depth(step, batch[j, Z], batch[j, INV_Z])
                         if ti.static(with_embedding):
-                            e0 += w * batch[S_EMBEDDING, j]
-                            e1 += w * batch[S_EMBEDDING + 1, j]
-                            e2 += w * batch[S_EMBEDDING + 2, j]
+                            e0 += w * batch[j, EMBEDDING]
+                            e1 += w * batch[j, EMBEDDING + 1]
+                            e2 += w * batch[j, EMBEDDING + 2]
                     if ti.simt.warp.any_nonzero(ti.u32(ALL), ti.cast(T >= T_MIN, ti.i32)) == 0:
                         is_open, bits = 0, 0
                         stopped_at = first + j + 1
@@ -214,11 +228,10 @@ def forward(
         if lane == 0:
             stop[tile, warp] = stopped_at
         if inside:
-            colour[y0 + y, x0 + x, 0], colour[y0 + y, x0 + x, 1], colour[y0 + y, x0 + x, 2] = r, g, b
-            depth[y0 + y, x0 + x], opacity[y0 + y, x0 + x] = d, 1.0 - T
+            colour[y, x, 0], colour[y, x, 1], colour[y, x, 2] = r, g, b
+            depth[y, x], opacity[y, x] = d, 1.0 - T
             if ti.static(with_embedding):
-                embedding[y0 + y, x0 + x, 0], embedding[y0 + y, x0 + x, 1] = e0, e1
-                embedding[y0 + y, x0 + x, 2] = e2
+                embedding[y, x, 0], embedding[y, x, 1], embedding[y, x, 2] = e0, e1, e2
 
 
 @ti.kernel
@@ -227,6 +240,7 @@ def backward(
     tiles_x: ti.i32,
     start: nd(ti.i32, ndim=1),  # [tiles + 1]
     ids: nd(ti.i32, ndim=1),  # [slots]
+    reached: nd(ti.i32, ndim=1),  # [slots] of `find_reach`
     splat: nd(ti.f32, ndim=2),  # [N, SPLAT]
     stop: nd(ti.i32, ndim=2),  # [tiles, WARPS] of `forward`
     with_embedding: ti.template(),
@@ -249,16 +263,13 @@ def backward(
     """
     ti.loop_config(block_dim=BLOCK)
     for i in range(tiles * BLOCK):
-        batch = ti.simt.block.SharedArray((ti.static(COLUMNS_EMBEDDING if with_embedding else COLUMNS), BLOCK), ti.f32)
-        reached = ti.simt.block.SharedArray((BLOCK,), ti.i32)
+        batch = ti.simt.block.SharedArray((BLOCK, SPLAT), ti.f32)
+        warps = ti.simt.block.SharedArray((BLOCK,), ti.i32)  # those that each splat of the batch reaches
         gaussian = ti.simt.block.SharedArray((BLOCK,), ti.i32)
         tile, thread = i // BLOCK, i % BLOCK
         warp, lane = thread // WARP, thread % WARP
-        x0, y0 = (tile % tiles_x) * TILE, tile // tiles_x * TILE
-        x, y = pixel_of(thread)
+        x, y = pixel_of(tile, tiles_x, warp, lane)
         px, py = ti.cast(x, ti.f32), ti.cast(y, ti.f32)
-        x += x0
-        y += y0
         T, rest = 0.0, 0.0  # transmittance, and g . out of what lies behind
         g0, g1, g2, gd, go, ge0, ge1, ge2, wc, wd = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         if x < depth.shape[1] and y < depth.shape[0]:
@@ -276,19 +287,19 @@ def backward(
         for w in ti.static(range(WARPS)):
             end = ti.max(end, stop[tile, w])
         while first < end:
-            reached[thread] = 0
+            gaussian[thread] = fetch(first, end, thread, ids, splat, batch)
+            warps[thread] = 0
             if first + thread < end:
-                fetch(first + thread, x0, y0, thread, ids, splat, with_embedding, batch, reached)
-                gaussian[thread] = ids[first + thread]
+                warps[thread] = reached[first + thread]
             ti.simt.block.sync()
             word = 0
             while word < BLOCK and first + word < stopped_at:
-                wanted = (reached[word + lane] >> warp) & ti.cast(first + word + lane < stopped_at, ti.i32)
+                wanted = (warps[word + lane] >> warp) & ti.cast(first + word + lane < stopped_at, ti.i32)
                 bits = ti.simt.warp.ballot(wanted)
                 while bits != 0:
-                    j = word + lowest_bit(bits)
+                    j = (word + lowest_bit(bits)) & (BLOCK - 1)  # seen to be less than BLOCK: cheap addresses
                     bits &= bits - 1
-                    dx, dy = px - batch[U, j], py - batch[V, j]
+                    dx, dy = px - batch[j, U], py - batch[j, V]
                     raw = alpha_before_cap(dx, dy, j, batch)
                     alpha = ti.min(raw, ALPHA_MAX)
                     touched = alpha > ALPHA_MIN and T > 0.0
@@ -296,13 +307,13 @@ def backward(
                         w, h, bend = 0.0, 0.0, 0.0
                         if touched:
                             w = T * alpha
-                            step = batch[ZU, j] * dx + batch[ZV, j] * dy
-                            bend = step * batch[S_INV_Z, j]
-                            gc = g0 * batch[RED, j] + g1 * batch[RED + 1, j] + g2 * batch[RED + 2, j]
-                            gc += gd * tangent_depth(step, batch[Z, j], batch[S_INV_Z, j]) + go
+                            step = batch[j, ZU] * dx + batch[j, ZV] * dy
+                            bend = step * batch[j, INV_Z]
+                            gc = g0 * batch[j, RED] + g1 * batch[j, RED + 1] + g2 * batch[j, RED + 2]
+                            gc += gd * tangent_depth(step, batch[j, Z], batch[j, INV_Z]) + go
                             if ti.static(with_embedding):
-                                gc += ge0 * batch[S_EMBEDDING, j] + ge1 * batch[S_EMBEDDING + 1, j]
-                                gc += ge2 * batch[S_EMBEDDING + 2, j]
+                                gc += ge0 * batch[j, EMBEDDING] + ge1 * batch[j, EMBEDDING + 1]
+                                gc += ge2 * batch[j, EMBEDDING + 2]
                             rest -= w * gc
                             if raw < ALPHA_MAX:
                                 h = alpha * (T * gc - rest / (1.0 - alpha))
@@ -332,19 +343,14 @@ def backward(
 @ti.kernel
 def count_passes(
     slots: ti.i32,
-    tiles_x: ti.i32,
     tile: nd(ti.i32, ndim=1),  # [slots]
-    ids: nd(ti.i32, ndim=1),  # [slots]
-    splat: nd(ti.f32, ndim=2),  # [N, SPLAT]
+    reached: nd(ti.i32, ndim=1),  # [slots]
     stop: nd(ti.i32, ndim=2),  # [tiles, WARPS] of `forward`
 ) -> ti.i32:
     """How many (splat, warp) pairs were blended: for benchmarks."""
     total = 0
     for slot in range(slots):
-        t, i = tile[slot], ids[slot]
-        u, v = splat[i, U] - t % tiles_x * TILE, splat[i, V] - t // tiles_x * TILE
-        mask = warps_reached(u, v, splat[i, QA], splat[i, QB], splat[i, QC], splat[i, FADE])
-        for w in ti.static(range(WARPS)):
-            if slot < stop[t, w]:
-                total += (mask >> w) & 1
+        for w in range(WARPS):
+            if slot < stop[tile[slot], w]:
+                total += (reached[slot] >> w) & 1
     return total

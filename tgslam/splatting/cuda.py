@@ -51,6 +51,7 @@ class CudaSplatting:
         self._pose_gradient = runtime.zeros((6,))
         self._sort, self._prefix_sums = RadixSort(), PrefixSums()
         self._slots = Pairs(1 << 15)  # tile, Gaussian
+        self._reached = runtime.empty((self._slots.capacity,), np.int32)
         self._splats = _SplatBuffers(1)
         self.slot_count = 0
 
@@ -62,10 +63,7 @@ class CudaSplatting:
     @property
     def pair_count(self) -> int:
         """(splat, pixel) pairs that the last `forward` blended, in whole warps: `backward` takes the same ones."""
-        slots = self._slots
-        return WARP * rasterize.count_passes(
-            self.slot_count, self.tiles_x, slots.keys, slots.values, self._splats.splat, self._stop
-        )
+        return WARP * int(rasterize.count_passes(self.slot_count, self._slots.keys, self._reached, self._stop))
 
     def forward(self, gaussians: GaussianMap, pose: np.ndarray, with_embedding: bool, images: RenderImages) -> None:
         """Render into `images`. pose: device array [12], rows of [R | t] of T_cw."""
@@ -75,8 +73,8 @@ class CudaSplatting:
             self._list_slots(gaussians.count)
         with stage(self.stopwatch, "blend"):
             rasterize.forward(
-                self.tiles, self.tiles_x, self._start, self._slots.values, self._splats.splat, with_embedding,
-                self._stop, images.colour, images.depth, images.opacity, images.embedding,
+                self.tiles, self.tiles_x, self._start, self._slots.values, self._reached, self._splats.splat,
+                with_embedding, self._stop, images.colour, images.depth, images.opacity, images.embedding,
             )  # fmt: skip
 
     def backward(
@@ -89,7 +87,7 @@ class CudaSplatting:
         with stage(self.stopwatch, "blend_backward"):
             splats.moments.fill(0)
             rasterize.backward(
-                self.tiles, self.tiles_x, self._start, self._slots.values, splats.splat, self._stop,
+                self.tiles, self.tiles_x, self._start, self._slots.values, self._reached, splats.splat, self._stop,
                 embedding, curvature, images.colour, images.depth, images.opacity, images.embedding,
                 g.colour, g.depth, g.opacity, g.embedding if embedding else self._no_embedding,
                 g.colour_weight if curvature else self._no_weight, g.depth_weight if curvature else self._no_weight,
@@ -123,6 +121,7 @@ class CudaSplatting:
         self.slot_count = self._prefix_sums(splats.tile_count, order.values, count, splats.first_of)
         if self.slot_count > self._slots.capacity:
             self._slots = Pairs(max(2 * self._slots.capacity, self.slot_count))
+            self._reached = runtime.empty((self._slots.capacity,), np.int32)
         slots = self._slots
         rasterize.list_slots(
             self.slot_count, count, order.values, splats.first_of, splats.tile_rect, self.tiles_x,
@@ -130,3 +129,4 @@ class CudaSplatting:
         )  # fmt: skip
         self._sort(slots, self.slot_count, (self.tiles - 1).bit_length())
         rasterize.find_starts(self.slot_count, self.tiles, slots.keys, self._start)
+        rasterize.find_reach(self.slot_count, self.tiles_x, slots.keys, slots.values, splats.splat, self._reached)
