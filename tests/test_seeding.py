@@ -8,11 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tgslam import images
+from tests.reference.seeding import cell_measures
+from tgslam import images, runtime
 from tgslam.config.schema import SeedingConfig, SyntheticConfig
 from tgslam.datasets.synthetic import SyntheticSource
 from tgslam.evaluation.images import masked_psnr
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, se3_exp, transform_points
+from tgslam.kernels import seeding as kernels
 from tgslam.mapping.seeding import Cells, quadtree, seed
 from tgslam.render import Rasterizer
 from tgslam.types import Camera, Frame, Gaussians
@@ -72,6 +74,28 @@ def patchy_frames(draw: st.DrawFn) -> tuple[NDArray, NDArray, NDArray]:
     texture = patches([0.0, 0.0, 0.3])[..., None] * rng.random((height, width, 3))
     wanted = patches([0.0, 1.0]) + (rng.random(depth_m.shape) < draw(st.sampled_from([0.0, 0.3]))) > 0
     return 0.5 + texture, depth_m, wanted
+
+
+@pytest.mark.parametrize("shape", [(24, 32), (37, 51), (5, 3)])
+@pytest.mark.parametrize("size", [1, 2, 4, 8])
+def test_plain_and_planar_cells_match_the_twin(shape: tuple[int, int], size: int) -> None:
+    rng = np.random.default_rng(size)
+    v, u = np.mgrid[: shape[0], : shape[1]]
+    rough = np.where(u + v < 0.4 * sum(shape), 0.0, rng.random(shape))
+    depth_m = 1.0 / (0.5 + 0.002 * u - 0.003 * v + 0.003 * rough * rng.normal(size=shape) + 0.1 * (u > 30))
+    depth_m[rng.random(shape) < 0.02] = 0.0
+    colour = 0.5 + 0.03 * (rough * rng.random(shape))[..., None] * rng.normal(size=(*shape, 3))
+    depth_m, colour = (image.astype(np.float32) for image in (depth_m, colour))
+    complete, spread, residual = cell_measures(colour.astype(float), depth_m.astype(float), size)
+    cells = runtime.empty(complete.shape, np.int32)
+    images_on_device = runtime.to_device(colour), runtime.to_device(depth_m)
+    kernels.plain_and_planar(*images_on_device, size, 0.01, 0.001, cells)
+    clear = (abs(spread - 0.01) > 1e-5) & (abs(residual - 0.001) > 1e-6)  # not at a threshold
+    assert clear.mean() > 0.99
+    expected = complete & (spread < 0.01) & (residual < 0.001)
+    np.testing.assert_array_equal((runtime.to_host(cells) > 0)[clear], expected[clear])
+    if shape[0] > 30 and size in (2, 4):
+        assert 0 < expected.sum() < complete.sum() < complete.size
 
 
 @settings(max_examples=150)

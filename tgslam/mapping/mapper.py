@@ -134,7 +134,8 @@ class Mapper:
         colour, depth_m = keyframe.colour(), keyframe.depth_m()
         sizes = cell_sizes(colour, depth_m, self.seeding, self.loss.depth_sigma_per_m2)
         wanted_px = np.zeros(len(surface.z))
-        wanted_px[surface.inside] = sizes[surface.v, surface.u]
+        smallest = self.seeding.smallest_cell_px
+        wanted_px[surface.inside] = sizes[surface.v // smallest, surface.u // smallest]
         in_plane = np.sort(np.exp(self.gaussians.host("log_scale")), axis=-1)[:, 1]
         std_px = in_plane * self.camera.fx / surface.z
         margin = 2.0 * std_px[surface.inside]

@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam import runtime
 from tgslam.config.schema import SeedingConfig
 from tgslam.geometry import inverse, quat_wxyz_from_matrices, transform_points
+from tgslam.kernels import seeding as kernels
 from tgslam.types import Camera, Gaussians
 
 _MIN_COSINE = 0.25  # foreshortening is compensated up to here: beyond, a cell's Gaussian would become a needle
@@ -26,58 +28,24 @@ class Cells:
     colour: NDArray[np.float64]  # [N, 3]
 
 
-def _blocks(image: NDArray[Any], size: int) -> NDArray[Any]:
-    """[H, W, ...] -> [H // size, W // size, size * size, ...]; the remainder at the right and bottom is cut off."""
-    rows, columns = image.shape[0] // size, image.shape[1] // size
-    cut = image[: rows * size, : columns * size]
-    split = cut.reshape(rows, size, columns, size, *image.shape[2:]).swapaxes(1, 2)
-    return split.reshape(rows, columns, size * size, *image.shape[2:])
-
-
-def _is_plain_and_planar(
-    colour: NDArray[np.floating], depth_m: NDArray[np.floating], size: int, config: SeedingConfig, sigma_per_m2: float
-) -> NDArray[np.bool_]:
-    """[rows, columns] cells in which every pixel has depth, colours hardly vary and one plane explains the depth.
-
-    A plane's inverse depth is affine in the pixel, so the fit is linear and on a regular grid closed-form.
-    """
-    z = _blocks(depth_m, size)
-    grey = _blocks(colour, size)
-    complete = (z > 0).all(-1)
-    plain = grey.std(2).max(-1) < config.plain_colour_std
-    inverse_z = 1.0 / np.where(z > 0, z, 1.0)
-    offset = np.arange(size) - (size - 1) / 2
-    y, x = (axis.reshape(-1) for axis in np.meshgrid(offset, offset, indexing="ij"))
-    norm = (x * x).sum()
-    mean = inverse_z.mean(-1)
-    fit = mean[..., None] + (inverse_z @ x / norm)[..., None] * x + (inverse_z @ y / norm)[..., None] * y
-    residual_rms = np.sqrt(((inverse_z - fit) ** 2).mean(-1))  # in 1/m, where the sensor's noise is uniform
-    return complete & plain & (residual_rms < config.planar_sigmas * sigma_per_m2)
-
-
-def _padded(image: NDArray[Any], largest: int) -> NDArray[Any]:
-    """The image with zeros at the right and bottom, so that the largest cells tile it."""
-    padding = [(0, -image.shape[0] % largest), (0, -image.shape[1] % largest)]
-    return np.pad(image, padding + [(0, 0)] * (image.ndim - 2))
-
-
-def _largest(config: SeedingConfig) -> int:
-    return config.smallest_cell_px * 2 ** (config.cell_levels - 1)
-
-
 def cell_sizes(
     colour: NDArray[np.floating], depth_m: NDArray[np.floating], config: SeedingConfig, sigma_per_m2: float
 ) -> NDArray[np.int32]:
-    """The quadtree of a frame: the size in pixels of the cell at each pixel [H, W], as large as the surface allows."""
-    size = _largest(config)
-    depth, rgb = _padded(depth_m.astype(np.float64), size), _padded(colour.astype(np.float64), size)
-    sizes = np.full(depth.shape, config.smallest_cell_px, np.int32)
-    while size > config.smallest_cell_px:
-        cells = _is_plain_and_planar(rgb, depth, size, config, sigma_per_m2)
-        whole = np.repeat(np.repeat(cells, size, 0), size, 1)
-        sizes = np.where(whole & (sizes < size), size, sizes)
-        size //= 2
-    return sizes[: depth_m.shape[0], : depth_m.shape[1]]
+    """The quadtree of a frame: the size in pixels of the cell at each of its smallest cells, [rows, columns].
+
+    It is as large as the surface allows: a larger one is plain and planar (`kernels.seeding`). Rows and columns are
+    those of the frame with zeros at the right and bottom, so that the largest cells tile it.
+    """
+    device = runtime.to_device(colour), runtime.to_device(depth_m)
+    rows, columns = _tiles(depth_m, config)
+    sizes = np.full((rows, columns), config.smallest_cell_px, np.int32)
+    for level in range(1, config.cell_levels):
+        size, step = config.smallest_cell_px << level, 1 << level
+        cells = runtime.empty((rows >> level, columns >> level), np.int32)
+        kernels.plain_and_planar(*device, size, config.plain_colour_std, config.planar_sigmas * sigma_per_m2, cells)
+        whole = runtime.to_host(cells) > 0
+        sizes[np.repeat(np.repeat(whole, step, 0), step, 1)] = size
+    return sizes
 
 
 def quadtree(
@@ -92,41 +60,75 @@ def quadtree(
     A cell that is wanted only in part is split; of the smallest ones, those are used that are wanted in half or more of
     their pixels with depth.
     """
-    size = _largest(config)
-    desired = _padded(cell_sizes(colour, depth_m, config, sigma_per_m2), size)
-    depth, rgb = _padded(depth_m.astype(np.float64), size), _padded(colour.astype(np.float64), size)
-    need = _padded(wanted & (depth_m > 0), size)
-    open_cells = np.ones((depth.shape[0] // size, depth.shape[1] // size), bool)
+    desired = cell_sizes(colour, depth_m, config, sigma_per_m2)
+    shape = (desired.shape[0] * config.smallest_cell_px, desired.shape[1] * config.smallest_cell_px)
+    depth, rgb = _padded(depth_m, shape), _padded(colour, shape)
+    valid = depth > 0
+    counts = _pyramid_of_counts(valid, config)
+    needs = _pyramid_of_counts(valid & _padded(wanted, shape), config)
+    open_cells = np.ones(counts[-1].shape, bool)
     found = []
-    while True:
-        valid = _blocks(depth, size) > 0
-        count, needed = valid.sum(-1), _blocks(need, size).sum(-1)
-        if size > config.smallest_cell_px:
-            use = open_cells & (desired[::size, ::size] >= size) & (needed == count) & (count > 0)
+    for level in reversed(range(config.cell_levels)):
+        count, needed, size = counts[level], needs[level], config.smallest_cell_px << level
+        if level:
+            use = open_cells & (desired[:: 1 << level, :: 1 << level] >= size) & (needed == count) & (count > 0)
         else:
             use = open_cells & (2 * needed >= count) & (count > 0)
-        found.append(_means(use, valid[use], depth, rgb, size))
-        if size <= config.smallest_cell_px:
-            break
-        open_cells = np.repeat(np.repeat(open_cells & ~use, 2, 0), 2, 1)
-        size //= 2
+        found.append(_means(use, depth, rgb, size))
+        if level:
+            open_cells = np.repeat(np.repeat(open_cells & ~use, 2, 0), 2, 1)
     return Cells(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 
+def _tiles(image: NDArray[Any], config: SeedingConfig) -> tuple[int, int]:
+    """Rows and columns of smallest cells that the largest cells over an image [H, W] hold."""
+    split = 1 << (config.cell_levels - 1)
+    largest = config.smallest_cell_px * split
+    return -(-image.shape[0] // largest) * split, -(-image.shape[1] // largest) * split
+
+
+def _padded(image: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:
+    """The image with zeros at the right and bottom."""
+    padding = [(0, wide - have) for wide, have in zip(shape, image.shape, strict=False)]
+    if not any(added for _, added in padding):
+        return image
+    return np.pad(image, padding + [(0, 0)] * (image.ndim - 2))
+
+
+def _pyramid_of_counts(mask: NDArray[np.bool_], config: SeedingConfig) -> list[NDArray[np.int32]]:
+    """How many pixels of each cell are set, from the smallest cells up."""
+    counts = [_block_sums(mask, config.smallest_cell_px)]
+    for _ in range(1, config.cell_levels):
+        counts.append(_block_sums(counts[-1], 2))
+    return counts
+
+
+def _block_sums(image: NDArray[Any], size: int) -> NDArray[np.int32]:
+    """Sums over blocks of size x size."""
+    total = np.zeros((image.shape[0] // size, image.shape[1] // size), np.int32)
+    for dy in range(size):
+        for dx in range(size):
+            total += image[dy::size, dx::size]
+    return total
+
+
 def _means(
-    use: NDArray[np.bool_], valid: NDArray[np.bool_], depth: NDArray[np.floating], rgb: NDArray[np.floating], size: int
+    use: NDArray[np.bool_], depth: NDArray[np.floating], rgb: NDArray[np.floating], size: int
 ) -> tuple[NDArray[np.float64], ...]:
-    """The columns of `Cells` for the blocks [rows, columns] in `use`, from their valid pixels [N, size * size]."""
+    """The columns of `Cells` for the blocks [rows, columns] in `use`, from their pixels with depth."""
     row, column = np.nonzero(use)
-    weight = valid / valid.sum(-1, keepdims=True)
     within_y, within_x = np.divmod(np.arange(size * size), size)
-    inverse_z = weight / np.where(valid, _blocks(depth, size)[use], 1.0)  # a plane's mean depth is that of the centre
+    at = row[:, None] * size + within_y, column[:, None] * size + within_x
+    z, colours = depth[at].astype(np.float64), rgb[at].astype(np.float64)
+    valid = z > 0
+    weight = valid / valid.sum(-1, keepdims=True)
+    inverse_z = weight / np.where(valid, z, 1.0)  # a plane's mean depth is that of the centre
     return (
         column * size + weight @ within_x,
         row * size + weight @ within_y,
         np.full(len(row), float(size)),
         1.0 / inverse_z.sum(-1),
-        np.einsum("np,npc->nc", weight, _blocks(rgb, size)[use]),
+        np.einsum("np,npc->nc", weight, colours),
     )
 
 
