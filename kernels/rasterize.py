@@ -1,10 +1,10 @@
 """Tile lists, forward and backward rasterization on the CPU, 16 pixels at a time.
 
 A tile's 16x16 pixels are 16 chunks of 4x4; the 16 lanes are a chunk's pixels. A slot is a splat in a tile, in depth
-order. `pack_slots` finds per slot the chunks that its alpha >= 1/255 ellipse touches, as a 16-bit mask, and copies the
-splat's row next to its neighbours in depth. The forward pass compresses a tile's slots into a list per chunk without a
-branch; the backward pass goes splat by splat over the set bits of its mask, with the lane sums of all its accumulators
-taken in one transposition. Every output has one writer, so results repeat bit for bit.
+order. `pack_tile` copies a slot's row next to its neighbours in depth and finds the chunks that its alpha >= 1/255
+ellipse touches. They are noted twice: as a mask of 16 bits a slot, and for each chunk as a number whose bits are the
+slots of a group that reach it. The forward pass goes chunk by chunk over the bits of those numbers, the backward pass
+splat by splat over those of its mask, with the lane sums of all accumulators taken in one transposition. Every output has one writer, so results repeat bit for bit.
 """
 
 import taichi as ti
@@ -41,6 +41,7 @@ nd = ti.types.ndarray
 G_COLOUR, G_DEPTH, G_OPACITY, W_COLOUR, W_DEPTH, G_EMBEDDING = 0, 3, 4, 7, 8, 9
 G_T, G_REST = 5, 6  # and what changes from splat to splat: transmittance, g . out of what lies behind
 G = 12
+GROUP = 23  # slots whose hits of a chunk make one number, which a float holds exactly
 SEGMENTS = 16  # parts of the depth order that are counted and scattered on their own
 _THREAD_STEP = 512  # iterations that Taichi hands a thread at a time
 
@@ -95,6 +96,18 @@ def fill_slots(
 
 
 @ti.func
+def groups_of(tile, start: ti.template()):
+    """How many groups the slots of a tile make."""
+    return (start[tile + 1] - start[tile] + GROUP - 1) // GROUP
+
+
+@ti.func
+def group_row(tile, start: ti.template()):
+    """Row of a tile's first group in an array of slots / GROUP + tiles rows."""
+    return start[tile] // GROUP + tile
+
+
+@ti.func
 def pack_tile(
     tile,
     tiles_x,
@@ -103,26 +116,37 @@ def pack_tile(
     splat: ti.template(),
     rows: ti.template(),
     mask: ti.template(),
+    groups: ti.template(),
 ):
-    """Copy a tile's splat rows into slot order and find the chunks each reaches; the lanes are the 16 chunks."""
+    """Copy a tile's splat rows into slot order and find the chunks each reaches; the lanes are the 16 chunks.
+
+    The arrays are those of `forward`.
+    """
     x0, y0 = ti.cast((tile % tiles_x) * TILE, ti.f32), ti.cast((tile // tiles_x) * TILE, ti.f32)
     chunk_x, chunk_y = float(CHUNK) * Lanes(LANE_X), float(CHUNK) * Lanes(LANE_Y)
     powers = Lanes([float(1 << c) for c in range(CHUNKS)])
-    for k in range(start[tile], start[tile + 1]):
-        row = splat[ids[k]]
-        u, v = row[U] - x0, row[V] - y0
-        a, b, c = row[QA], row[QB], row[QC]
-        row[U], row[V] = u, v
-        rows[k] = row
-        reach = (REACH - row[FADE]) * 1.0001 + 1e-5
-        slope_y, slope_x = -0.5 * b / c, -0.5 * b / a
-        xa, ya = chunk_x - u, chunk_y - v
-        xb, yb = xa + (CHUNK - 1.0), ya + (CHUNK - 1.0)
-        # the chunk's lines nearest to the centre, and the least exponent on each
-        xn, yn = smaller(larger(xa, Lanes(0.0)), xb), smaller(larger(ya, Lanes(0.0)), yb)
-        y1, x1 = smaller(larger(slope_y * xn, ya), yb), smaller(larger(slope_x * yn, xa), xb)
-        q = smaller((a * xn + b * y1) * xn + c * y1 * y1, (a * x1 + b * yn) * x1 + c * yn * yn)
-        mask[k] = ti.cast(lane_sum(ti.select(q <= Lanes(reach), powers, Lanes(0.0))), ti.i32)
+    for group in range(groups_of(tile, start)):
+        first = start[tile] + group * GROUP
+        hits, power = Lanes(0.0), 1.0
+        for k in range(first, ti.min(first + GROUP, start[tile + 1])):
+            row = splat[ids[k]]
+            u, v = row[U] - x0, row[V] - y0
+            a, b, c = row[QA], row[QB], row[QC]
+            row[U], row[V] = u, v
+            rows[k] = row
+            reach = (REACH - row[FADE]) * 1.0001 + 1e-5
+            slope_y, slope_x = -0.5 * b / c, -0.5 * b / a
+            xa, ya = chunk_x - u, chunk_y - v
+            xb, yb = xa + (CHUNK - 1.0), ya + (CHUNK - 1.0)
+            # the chunk's lines nearest to the centre, and the least exponent on each
+            xn, yn = smaller(larger(xa, Lanes(0.0)), xb), smaller(larger(ya, Lanes(0.0)), yb)
+            y1, x1 = smaller(larger(slope_y * xn, ya), yb), smaller(larger(slope_x * yn, xa), xb)
+            q = smaller((a * xn + b * y1) * xn + c * y1 * y1, (a * x1 + b * yn) * x1 + c * yn * yn)
+            reached = q <= Lanes(reach)
+            mask[k] = ti.cast(lane_sum(ti.select(reached, powers, Lanes(0.0))), ti.i32)
+            hits += ti.select(reached, Lanes(power), Lanes(0.0))
+            power *= 2.0
+        groups[group_row(tile, start) + group] = hits
 
 
 @lanes_kernel
@@ -135,7 +159,9 @@ def forward(
     rows: nd(Lanes, ndim=1),  # [slots] out: the splats' rows, u and v relative to the tile
     slot: nd(ti.f32, ndim=2),  # [slots, SPLAT] the same memory as rows
     mask: nd(ti.i32, ndim=1),  # [slots] out: bit c = the splat reaches chunk c, and no opaque splats hide it there
-    todo: nd(ti.i32, ndim=2),  # [PER_ROW, slots] scratch: a tile's lists for a row of its chunks
+    groups: nd(Lanes, ndim=1),  # [slots / GROUP + tiles] scratch: a group's slots that reach chunk c, as bits of lane c
+    hits: nd(ti.f32, ndim=2),  # [slots / GROUP + tiles, CHUNKS] the same memory
+    pixels: nd(Lanes, ndim=2),  # [CHUNKS, 2] x and y of a chunk's pixels in its tile
     with_embedding: ti.template(),
     colour: nd(ti.f32, ndim=3),  # [H, W, 3] out
     depth: nd(ti.f32, ndim=2),  # [H, W] out, m, sum of weight times tangent-plane depth
@@ -146,24 +172,19 @@ def forward(
     for spread in range(tiles * SPREAD):
         tile = spread // SPREAD
         if spread - tile * SPREAD == 0:
-            pack_tile(tile, tiles_x, start, ids, splat, rows, mask)
-            first = start[tile]
-            for chunk_row in range(PER_ROW):
-                n0, n1, n2, n3 = 0, 0, 0, 0
-                for k in range(first, start[tile + 1]):
-                    bits = mask[k] >> (chunk_row * PER_ROW)
-                    todo[0, first + n0], todo[1, first + n1], todo[2, first + n2], todo[3, first + n3] = k, k, k, k
-                    n0, n1, n2, n3 = n0 + (bits & 1), n1 + (bits >> 1 & 1), n2 + (bits >> 2 & 1), n3 + (bits >> 3 & 1)
-                for column in range(PER_ROW):
-                    n = ti.select(column < 2, ti.select(column == 0, n0, n1), ti.select(column == 2, n2, n3))
-                    chunk = chunk_row * PER_ROW + column
-                    px = Lanes(LANE_X) + ti.cast(column * CHUNK, ti.f32)
-                    py = Lanes(LANE_Y) + ti.cast(chunk_row * CHUNK, ti.f32)
-                    T, r, g, b, d = Lanes(1.0), Lanes(0.0), Lanes(0.0), Lanes(0.0), Lanes(0.0)
-                    e0, e1, e2 = Lanes(0.0), Lanes(0.0), Lanes(0.0)
-                    m, done = 0, n
-                    while m < done:
-                        k = todo[column, first + m]
+            pack_tile(tile, tiles_x, start, ids, splat, rows, mask, groups)
+            for chunk in range(CHUNKS):
+                px, py = pixels[chunk, 0], pixels[chunk, 1]
+                T, r, g, b, d = Lanes(1.0), Lanes(0.0), Lanes(0.0), Lanes(0.0), Lanes(0.0)
+                e0, e1, e2 = Lanes(0.0), Lanes(0.0), Lanes(0.0)
+                m, end = 0, start[tile + 1]
+                for group in range(groups_of(tile, start)):
+                    base = start[tile] + group * GROUP
+                    bits = ti.select(base < end, ti.cast(hits[group_row(tile, start) + group, chunk], ti.i32), 0)
+                    while bits != 0:
+                        lowest = bits & (-bits)
+                        bits ^= lowest
+                        k = base + 31 - ti.math.clz(lowest)
                         dx, dy = px - slot[k, U], py - slot[k, V]
                         raw = raw_alpha(dx, dy, slot[k, QA], slot[k, QB], slot[k, QC], slot[k, FADE])
                         w = T * ti.select(raw > Lanes(ALPHA_MIN), at_most(raw, ALPHA_MAX), Lanes(0.0))
@@ -179,18 +200,19 @@ def forward(
                         m += 1
                         if (m & 7) == 0:
                             if lane_max(T) < T_MIN:
-                                done = m
-                    for rest in range(done, n):
-                        mask[todo[column, first + rest]] &= ~(1 << chunk)
-                    x0 = (tile % tiles_x) * TILE + column * CHUNK
-                    y0 = (tile // tiles_x) * TILE + chunk_row * CHUNK
-                    for j in ti.static(range(LANES)):
-                        x, y = x0 + j % CHUNK, y0 + j // CHUNK
-                        if x < depth.shape[1] and y < depth.shape[0]:
-                            colour[y, x, 0], colour[y, x, 1], colour[y, x, 2] = r[j], g[j], b[j]
-                            depth[y, x], opacity[y, x] = d[j], 1.0 - T[j]
-                            if ti.static(with_embedding):
-                                embedding[y, x, 0], embedding[y, x, 1], embedding[y, x, 2] = e0[j], e1[j], e2[j]
+                                bits = 0
+                                end = k + 1
+                for k in range(end, start[tile + 1]):
+                    mask[k] = mask[k] & ~(1 << chunk)
+                x0 = (tile % tiles_x) * TILE + (chunk % PER_ROW) * CHUNK
+                y0 = (tile // tiles_x) * TILE + (chunk // PER_ROW) * CHUNK
+                for j in ti.static(range(LANES)):
+                    x, y = x0 + j % CHUNK, y0 + j // CHUNK
+                    if x < depth.shape[1] and y < depth.shape[0]:
+                        colour[y, x, 0], colour[y, x, 1], colour[y, x, 2] = r[j], g[j], b[j]
+                        depth[y, x], opacity[y, x] = d[j], 1.0 - T[j]
+                        if ti.static(with_embedding):
+                            embedding[y, x, 0], embedding[y, x, 1], embedding[y, x, 2] = e0[j], e1[j], e2[j]
 
 
 @ti.func

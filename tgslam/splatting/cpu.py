@@ -19,11 +19,11 @@ _MOMENT_ROWS = 2  # vectors that hold a splat's moments
 class _SlotBuffers:
     """Scratch for one entry per (splat, tile), grown by doubling."""
 
-    def __init__(self, capacity: int) -> None:
+    def __init__(self, capacity: int, tiles: int) -> None:
         self.capacity = capacity
         self.ids = runtime.empty((capacity,), np.int32)
         self.entry = runtime.empty((capacity,), np.int32)
-        self.todo = runtime.empty((PER_ROW, capacity), np.int32)
+        self.groups = runtime.empty((capacity // rasterize.GROUP + tiles, CHUNKS), lanes=True)
         self.mask = runtime.empty((capacity,), np.int32)
         self.slot = runtime.empty((capacity, projection.SPLAT))
         self.grad = runtime.empty((capacity, LANES), lanes=True)
@@ -55,7 +55,7 @@ class CpuSplatting:
         self._g = runtime.zeros((self.tiles * CHUNKS, rasterize.G, LANES), lanes=True)
         self._no_weight = runtime.zeros((H, W))
         self._no_embedding = runtime.zeros((H, W, 3))
-        self._slots = _SlotBuffers(1 << 15)
+        self._slots = _SlotBuffers(1 << 15, self.tiles)
         self._splats = _SplatBuffers(1)
         self._start = runtime.zeros((self.tiles + 1,), np.int32)
         self._per_tile = runtime.zeros((self.tiles, rasterize.SEGMENTS), np.int32)
@@ -81,7 +81,7 @@ class CpuSplatting:
         with stage(self.stopwatch, "blend"):
             rasterize.forward(
                 self.tiles, self.tiles_x, self._start, slots.ids, self._splats.splat,
-                slots.slot, slots.slot, slots.mask, slots.todo, with_embedding,
+                slots.slot, slots.slot, slots.mask, slots.groups, slots.groups, self._pixels, with_embedding,
                 images.colour, images.depth, images.opacity, images.embedding,
             )  # fmt: skip
 
@@ -133,7 +133,7 @@ class CpuSplatting:
         ends = np.cumsum(tile_count, dtype=np.int32)
         self.slot_count = int(ends[-1]) if count else 0
         if self.slot_count > self._slots.capacity:
-            self._slots = _SlotBuffers(max(2 * self._slots.capacity, self.slot_count))
+            self._slots = _SlotBuffers(max(2 * self._slots.capacity, self.slot_count), self.tiles)
         np.subtract(ends, tile_count, out=splats.first_of[:count])
         visible = np.flatnonzero(tile_count)
         order = _depth_order(runtime.to_host(splats.splat)[visible, projection.Z], visible)
