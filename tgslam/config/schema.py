@@ -146,6 +146,39 @@ class MappingConfig:
 
 
 @dataclass(frozen=True)
+class PlanesConfig:
+    """Planes of single views, and the persistent ones (PGIs, section 3.3) that they are matched to."""
+
+    # Planar Gaussian Instances
+    cell_m: float = setting(0.05, 0.005, 1.0)  # of the grid that holds the extent of a PGI
+    max_angle_rad: float = setting(0.2, 0.01, 1.57)  # theta_max of Eq. 5
+    max_offset_ratio: float = setting(0.1, 1e-3, 10.0)  # delta_max of Eq. 5, offsets from the camera
+    max_distance_m: float = setting(0.15, 0.001, 10.0)  # centroid of a segment to the plane of its PGI
+    gate_sigmas: float = setting(3.4, 0.5, 100.0)  # deviation of a segment from its PGI under both covariances
+    weight_angle: float = setting(0.5, 0.0, 100.0)  # w_theta of Eq. 7
+    weight_offset: float = setting(0.5, 0.0, 100.0)  # w_d of Eq. 7
+    weight_overlap: float = setting(1.0, 0.0, 100.0)  # w_o of Eq. 7
+    min_overlap: float = setting(0.25, 0.0, 1.0)  # intersection of the two masks over the smaller one
+    mask_width_px: int = setting(128, 16, 4096)  # the masks of Eq. 6 are at most this wide
+    max_gap_m: float = setting(0.1, 0.0, 10.0)  # surfaces this close to each other in their plane adjoin
+    bridge_m: float = setting(1.0, 0.0, 100.0)  # likewise across a gap that something in front of it hides
+    pose_sigma_rad: float = setting(0.003, 0.0, 1.0)  # of a keyframe
+    pose_sigma_m: float = setting(0.01, 1e-4, 1.0)  # of a keyframe
+    model_sigma_rad: float = setting(0.01, 1e-5, 1.0)  # real surfaces are not quite planes
+    model_sigma_m: float = setting(0.003, 1e-5, 1.0)  # likewise
+    independent_views: int = setting(10, 1, 100_000)  # however many there are, they inform no more than so many
+    observations: int = setting(256, 8, 100_000)  # kept of each PGI
+    confirm_views: int = setting(3, 2, 1000)  # views that make an ambiguous segment a PGI
+    candidate_keyframes: int = setting(10, 1, 100_000)  # in which it is not confirmed drop it
+    through_share: float = setting(0.6, 0.1, 1.0)  # of a PGI's visible extent that a view sees through speaks against it
+    through_keyframes: int = setting(3, 1, 1000)  # that speak against a PGI, one after the other, remove it
+    # Structure cue for keyframes (section 3.1)
+    cue_angle_rad: float = setting(0.2, 0.0, 3.15)  # tau_theta
+    cue_distance_m: float = setting(0.25, 0.0, 100.0)  # tau_d
+    cue_ratio: float = setting(0.5, 0.0, 1.0)  # tau_ratio
+
+
+@dataclass(frozen=True)
 class EvaluationConfig:
     """The fixed protocol: held-out frames never reach mapping, and keyframes are never held out."""
 
@@ -165,5 +198,6 @@ class Config:
     keyframes: KeyframeConfig = dataclasses.field(default_factory=KeyframeConfig)
     seeding: SeedingConfig = dataclasses.field(default_factory=SeedingConfig)
     mapping: MappingConfig = dataclasses.field(default_factory=MappingConfig)
+    planes: PlanesConfig = dataclasses.field(default_factory=PlanesConfig)
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
