@@ -4,8 +4,8 @@ A tile's 16x16 pixels are 16 chunks of 4x4; the 16 lanes are a chunk's pixels. A
 order. `pack_tile` copies a slot's row next to its neighbours in depth and finds the chunks that its alpha >= 1/255
 ellipse touches. They are noted twice: as a mask of 16 bits a slot, and for each chunk as a number whose bits are the
 slots of a group that reach it. The forward pass goes chunk by chunk over the bits of those numbers, the backward pass
-splat by splat over those of its mask, with the lane sums of all accumulators taken in one transposition. Every output has
-one writer, so results repeat bit for bit.
+splat by splat over those of its mask, with the lane sums of all accumulators taken in one transposition. Every output
+has one writer, so results repeat bit for bit.
 """
 
 import taichi as ti
