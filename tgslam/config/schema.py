@@ -170,7 +170,9 @@ class PlanesConfig:
     observations: int = setting(256, 8, 100_000)  # kept of each PGI
     confirm_views: int = setting(3, 2, 1000)  # views that make an ambiguous segment a PGI
     candidate_keyframes: int = setting(10, 1, 100_000)  # in which it is not confirmed drop it
-    through_share: float = setting(0.6, 0.1, 1.0)  # of a PGI's visible extent that a view sees through speaks against it
+    through_share: float = setting(
+        0.6, 0.1, 1.0
+    )  # of a PGI's visible extent that a view sees through speaks against it
     through_keyframes: int = setting(3, 1, 1000)  # that speak against a PGI, one after the other, remove it
     # Structure cue for keyframes (section 3.1)
     cue_angle_rad: float = setting(0.2, 0.0, 3.15)  # tau_theta
