@@ -1,21 +1,12 @@
-"""Adam kernels: one fused pass over parameter, gradient and both moments, rows in parallel."""
+"""Adam: one fused pass over the parameters, gradients and moments of all groups, rows in parallel."""
 
 import taichi as ti
 
-F1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
+GROUPS = 5  # at most
 F2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
 I1 = ti.types.ndarray(dtype=ti.i32, ndim=1)
-
-
-@ti.kernel
-def count_steps(
-    rows: ti.i32,  # rows in use, at most the length of each array
-    visible: I1,  # [N] 0 = leave the row alone
-    steps: I1,  # [N] updates that each row has had, in and out
-):
-    """Count one more update for every visible row."""
-    for i in range(rows):
-        steps[i] = steps[i] + ti.select(visible[i] != 0, 1, 0)
+Values = ti.types.ndarray(dtype=ti.f32)  # [N] or [N, C]
+Rates = ti.types.vector(GROUPS, ti.f32)
 
 
 @ti.func
@@ -28,59 +19,41 @@ def update(g, m_old, v_old, gain1, gain2, epsilon, correct_m, correct_v):
 
 @ti.kernel
 def adam_rows(
-    rows: ti.i32,
-    rate: ti.f32,
+    rows: ti.i32,  # rows in use, at most the length of each array
+    rates: Rates,  # by group
     gain1: ti.f32,  # 1 - beta1, rounded once: 1 - 0.999 in float32 is 5e-5 off
     gain2: ti.f32,  # 1 - beta2
     epsilon: ti.f32,
     correction: F2,  # [T, 2] 1 / (1 - beta^t) of both moments after t updates; the last row holds for every later t
-    steps: I1,  # [N] updates including this one
-    visible: I1,  # [N]
-    gradient: F2,  # [N, C]
-    parameter: F2,  # [N, C] in and out
-    m: F2,  # [N, C] first moment, in and out
-    v: F2,  # [N, C] second moment, in and out
-    channels: ti.template(),  # C: known to the compiler, the row is loaded and stored at once
+    visible: I1,  # [N] 0 = leave the row alone
+    steps: I1,  # [N] updates that each row has had, in and out
+    moments: F2,  # [N, M] in and out; of a group, C first moments and C second ones from its first column on
+    gradient0: Values,  # of the first group, and so on; those beyond the last group are not looked at
+    parameter0: Values,  # in and out
+    gradient1: Values,
+    parameter1: Values,
+    gradient2: Values,
+    parameter2: Values,
+    gradient3: Values,
+    parameter3: Values,
+    gradient4: Values,
+    parameter4: Values,
+    groups: ti.template(),  # for each group, its first column in `moments` and its C, 0 for arrays [N]
 ):
     """Adam with a bias correction of its own for each row; rows that are not visible keep value and moments."""
     for i in range(rows):
         if visible[i] != 0:
+            steps[i] += 1
             t = ti.min(steps[i], correction.shape[0] - 1)
             correct_m, correct_v = correction[t, 0], correction[t, 1]
-            g = ti.Vector([gradient[i, c] for c in ti.static(range(channels))])
-            m_old = ti.Vector([m[i, c] for c in ti.static(range(channels))])
-            v_old = ti.Vector([v[i, c] for c in ti.static(range(channels))])
-            value = ti.Vector([parameter[i, c] for c in ti.static(range(channels))])
-            m_new, v_new, change = update(g, m_old, v_old, gain1, gain2, epsilon, correct_m, correct_v)
-            value = value - rate * change
-            for c in ti.static(range(channels)):
-                m[i, c] = m_new[c]
-                v[i, c] = v_new[c]
-                parameter[i, c] = value[c]
-
-
-@ti.kernel
-def adam_scalars(
-    rows: ti.i32,
-    rate: ti.f32,
-    gain1: ti.f32,  # 1 - beta1
-    gain2: ti.f32,  # 1 - beta2
-    epsilon: ti.f32,
-    correction: F2,  # [T, 2]
-    steps: I1,  # [N]
-    visible: I1,  # [N]
-    gradient: F1,  # [N]
-    parameter: F1,  # [N] in and out
-    m: F1,  # [N] in and out
-    v: F1,  # [N] in and out
-):
-    """`adam_rows` for a parameter with one value a row."""
-    for i in range(rows):
-        if visible[i] != 0:
-            t = ti.min(steps[i], correction.shape[0] - 1)
-            m_new, v_new, change = update(
-                gradient[i], m[i], v[i], gain1, gain2, epsilon, correction[t, 0], correction[t, 1]
-            )
-            m[i] = m_new
-            v[i] = v_new
-            parameter[i] = parameter[i] - rate * change
+            for k in ti.static(range(len(groups))):
+                gradient = ti.static((gradient0, gradient1, gradient2, gradient3, gradient4)[k])
+                parameter = ti.static((parameter0, parameter1, parameter2, parameter3, parameter4)[k])
+                for c in ti.static(range(max(groups[k][1], 1))):
+                    at = ti.static((i, c) if groups[k][1] else (i,))
+                    m = ti.static(groups[k][0] + c)
+                    v = ti.static(m + max(groups[k][1], 1))
+                    moments[i, m], moments[i, v], change = update(
+                        gradient[at], moments[i, m], moments[i, v], gain1, gain2, epsilon, correct_m, correct_v
+                    )
+                    parameter[at] -= rates[k] * change

@@ -33,13 +33,14 @@ from tgslam.kernels.objective import (
     share,
     ssim_slopes,
 )
-from tgslam.kernels.simd import LANES, SPREAD, Lanes, lane_sum, lanes_kernel
+from tgslam.kernels.simd import LANES, Lanes, lane_sum, lanes_kernel
 
 F1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
 F2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
 L2 = ti.types.ndarray(dtype=Lanes, ndim=2)
 L3 = ti.types.ndarray(dtype=Lanes, ndim=3)
 
+ROW_SPREAD = 64  # a loop over rows counts in steps of this: Taichi hands a thread 512 iterations at a time, so 8 rows
 LANE = tuple(float(k) for k in range(LANES))
 LUMA_PARTS = tuple(tuple(LUMA[(LANES * part + k) % 3] for k in range(LANES)) for part in range(3))
 MOMENTS = 3  # fields under the SSIM window: x, x^2, x y
@@ -133,9 +134,9 @@ def observe_luma(
 ):
     """Luminance and texture of an observation."""
     height = luma.shape[0]
-    for spread in range(height * SPREAD):
-        i = spread // SPREAD
-        if spread - i * SPREAD == 0:
+    for spread in range(height * ROW_SPREAD):
+        i = spread // ROW_SPREAD
+        if spread - i * ROW_SPREAD == 0:
             inside = ti.select(is_inside_row(i, height), 1.0, 0.0)
             for b in range(luma.shape[1]):
                 luma[i, b] = luma_at(colour, i, b)
@@ -150,9 +151,9 @@ def observe_statistics(
 ):
     """The observed side of SSIM."""
     height = luma.shape[0]
-    for spread in range(height * SPREAD):
-        i = spread // SPREAD
-        if spread - i * SPREAD == 0 and is_inside_row(i, height):
+    for spread in range(height * ROW_SPREAD):
+        i = spread // ROW_SPREAD
+        if spread - i * ROW_SPREAD == 0 and is_inside_row(i, height):
             for b in range(luma.shape[1]):
                 y = luma[i, b]
                 first, square = TAPS[RADIUS] * y, TAPS[RADIUS] * y * y
@@ -187,9 +188,9 @@ def mix(
 ):
     """What the structure terms compare, and the pixel counts."""
     height = luma.shape[0]
-    for spread in range(height * SPREAD):
-        i = spread // SPREAD
-        if spread - i * SPREAD == 0:
+    for spread in range(height * ROW_SPREAD):
+        i = spread // ROW_SPREAD
+        if spread - i * ROW_SPREAD == 0:
             pixels, inner, depths = Lanes(0.0), Lanes(0.0), Lanes(0.0)
             for b in range(luma.shape[1]):
                 rendered = opacity[i, b]
@@ -225,9 +226,9 @@ def structure(
 ):
     """SSIM in the 11x11 Gaussian window, and Charbonnier on the length of the Sobel gradient (over 8) of x - y."""
     height, blocks = x.shape[0], x.shape[1]
-    for spread in range(height * SPREAD):
-        i = spread // SPREAD
-        if spread - i * SPREAD == 0 and is_inside_row(i, height):
+    for spread in range(height * ROW_SPREAD):
+        i = spread // ROW_SPREAD
+        if spread - i * ROW_SPREAD == 0 and is_inside_row(i, height):
             for b in range(blocks):
                 blur_moments(x, y, i, b, column)
             ssim, grad = Lanes(0.0), Lanes(0.0)
@@ -343,9 +344,9 @@ def gradient(
     The curvatures are those of reweighted least squares; that of colour has one weight a pixel, from the mean square of
     its residuals.
     """
-    for spread in range(x.shape[0] * SPREAD):
-        i = spread // SPREAD
-        if spread - i * SPREAD == 0:
+    for spread in range(x.shape[0] * ROW_SPREAD):
+        i = spread // ROW_SPREAD
+        if spread - i * ROW_SPREAD == 0:
             per_l1 = share(weight_l1, 3.0 * totals[PIXELS])
             per_grad, per_ssim = share(weight_grad, totals[INNER]), share(weight_ssim, totals[INNER])
             per_geo = share(weight_geo, totals[DEPTHS])

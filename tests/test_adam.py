@@ -14,9 +14,9 @@ def rng():
 
 
 def test_matches_the_twin_with_rows_that_come_and_go(rng):
-    rows, shapes = 37, {"mean": (37, 3), "opacity": (37,)}
-    rates = {"mean": 1e-2, "opacity": 5e-2}
-    adam = Adam({"mean": 3, "opacity": 0}, rates, rows)
+    rows, shapes = 37, {"mean": (37, 3), "opacity": (37,), "quat": (37, 4), "scale": (37, 3), "colour": (37, 3)}
+    rates = {"mean": 1e-2, "opacity": 5e-2, "quat": 2e-3, "scale": 4e-3, "colour": 1e-3}
+    adam = Adam({name: shape[1] if len(shape) > 1 else 0 for name, shape in shapes.items()}, rates, rows)
     start = {name: rng.normal(size=shape) for name, shape in shapes.items()}
     values = {name: runtime.to_device(value) for name, value in start.items()}
     twins = {name: reference.Adam(shape, rates[name]) for name, shape in shapes.items()}
@@ -75,6 +75,17 @@ def test_moments_move_with_their_rows(rng, by_mask):
     np.testing.assert_array_equal(adam.step_counts(), [1] * 4 + [0] * 200)
 
 
+def test_groups_that_are_not_given_rest(rng):
+    adam, alone = (Adam(dict.fromkeys(names, 2), dict.fromkeys(names, 0.1), 6) for names in ("xyz", "y"))
+    gradient = runtime.to_device(rng.normal(size=(6, 2)))
+    both = runtime.zeros((6, 2)), runtime.zeros((6, 2))
+    for optimiser, y in zip((adam, alone), both, strict=True):
+        optimiser.step({"y": y}, {"y": gradient})
+    np.testing.assert_array_equal(*(runtime.to_host(y) for y in both))
+    np.testing.assert_array_equal(adam.moments("y"), alone.moments("y"))
+    assert not np.any(adam.moments("x")) and not np.any(adam.moments("z"))
+
+
 def test_rows_that_left_leave_no_moments_behind(rng):
     adam = Adam({"x": 2}, {"x": 0.1}, 8)
     adam.step({"x": runtime.zeros((8, 2))}, {"x": runtime.to_device(rng.normal(size=(8, 2)))})
@@ -101,6 +112,8 @@ def test_minimises_a_badly_scaled_quadratic():
 def test_wrong_arguments_are_named(rng):
     with pytest.raises(ValueError, match="learning rates"):
         Adam({"x": 2}, {"y": 0.1}, 5)
+    with pytest.raises(ValueError, match="at most 5 groups"):
+        Adam(dict.fromkeys("abcdef", 1), dict.fromkeys("abcdef", 0.1))
     adam = Adam({"x": 2}, {"x": 0.1}, 5)
     good = runtime.zeros((5, 2))
     with pytest.raises(ValueError, match="unknown group 'z'"):

@@ -34,12 +34,15 @@ class Adam:
         """channels: values per row of each group, 0 for a one-dimensional array [N].
 
         learning_rates: per group, in the parameter's unit; may be changed between steps. betas, epsilon: as usual in
-        Adam. Raises ValueError if the two dicts name different groups.
+        Adam. Raises ValueError if the two dicts name different groups, or more than five.
         """
         if channels.keys() != learning_rates.keys():
             raise ValueError(f"groups {sorted(channels)} need learning rates, but got {sorted(learning_rates)}")
+        if len(channels) > kernels.GROUPS:
+            raise ValueError(f"at most {kernels.GROUPS} groups, but got {sorted(channels)}")
         self.learning_rates = dict(learning_rates)
         self._channels = dict(channels)
+        self._first_column, self._columns = _columns(channels)
         self._gains, self._epsilon = (1.0 - betas[0], 1.0 - betas[1]), epsilon
         self._rows = rows
         self._correction = runtime.to_device(_corrections(*betas))
@@ -52,7 +55,11 @@ class Adam:
 
     def moments(self, group: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Host views or copies of the first and second moment of a group, [rows] or [rows, C]."""
-        return runtime.to_host(self._m[group])[: self._rows], runtime.to_host(self._v[group])[: self._rows]
+        channels = self._channels[group]
+        first, middle, end = (self._first_column[group] + k * max(channels, 1) for k in range(3))
+        host = runtime.to_host(self._moments)[: self._rows]
+        m, v = host[:, first:middle], host[:, middle:end]
+        return (m, v) if channels else (m[:, 0], v[:, 0])
 
     def step_counts(self) -> NDArray[np.int32]:
         """Updates that each row has had, [rows]."""
@@ -75,16 +82,15 @@ class Adam:
         if visible is None:
             visible = self._all_visible
         require("visible", visible, (self._rows,), np.int32, at_least=True)
-        kernels.count_steps(self._rows, visible, self._steps)
-        for group, parameter in parameters.items():
-            arguments = (
-                self._rows, self.learning_rates[group], *self._gains, self._epsilon, self._correction, self._steps,
-                visible, gradients[group], parameter, self._m[group], self._v[group],
-            )  # fmt: skip
-            if self._channels[group]:
-                kernels.adam_rows(*arguments, self._channels[group])
-            else:
-                kernels.adam_scalars(*arguments)
+        if not parameters:
+            return
+        arrays = [array for group in parameters for array in (gradients[group], parameters[group])]
+        unused = kernels.GROUPS - len(parameters)
+        kernels.adam_rows(
+            self._rows, [self.learning_rates[group] for group in parameters] + [0.0] * unused,
+            *self._gains, self._epsilon, self._correction, visible, self._steps, self._moments,
+            *arrays, *arrays[:2] * unused, tuple((self._first_column[g], self._channels[g]) for g in parameters),
+        )  # fmt: skip
 
     def append(self, rows: int) -> None:
         """Add rows with no history at the end."""
@@ -112,20 +118,26 @@ class Adam:
         return (rows, channels) if channels else (rows,)
 
     def _allocate(self, capacity: int) -> None:
-        self._m = {group: runtime.zeros(self._shape(group, capacity)) for group in self._channels}
-        self._v = {group: runtime.zeros(self._shape(group, capacity)) for group in self._channels}
+        self._moments = runtime.zeros((capacity, self._columns))
         self._steps = runtime.zeros((capacity,), np.int32)
         self._all_visible = runtime.empty((capacity,), np.int32)
         self._all_visible.fill(1)
 
     def _reallocate(self, kept: NDArray[np.integer], capacity: int) -> None:
         """New arrays that start with the rows `kept` of the old ones, the rest zero."""
-        old_m, old_v, old_steps = self._m, self._v, self._steps
+        old_moments, old_steps = self._moments, self._steps
         self._allocate(capacity)
-        for group in self._channels:
-            self._m[group] = _moved(old_m[group], kept, self._m[group])
-            self._v[group] = _moved(old_v[group], kept, self._v[group])
+        self._moments = _moved(old_moments, kept, self._moments)
         self._steps = _moved(old_steps, kept, self._steps)
+
+
+def _columns(channels: dict[str, int]) -> tuple[dict[str, int], int]:
+    """First column of each group's moments in a row, and the columns of a row: both moments of every value."""
+    first, columns = {}, 0
+    for group, values in channels.items():
+        first[group] = columns
+        columns += 2 * max(values, 1)
+    return first, columns
 
 
 def _moved(old: np.ndarray, kept: NDArray[np.integer], new: np.ndarray) -> np.ndarray:

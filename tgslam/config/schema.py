@@ -149,6 +149,21 @@ class MappingConfig:
 class PlanesConfig:
     """Planes of single views, and the persistent ones (PGIs, section 3.3) that they are matched to."""
 
+    # Segments of single views (section 3.2); sigmas are of the sensor's inverse depth at a pixel
+    max_segments: int = setting(10, 1, 1000)  # K: the largest ones are kept
+    cell_px: int = setting(8, 4, 64)  # squares of pixels that segmentation starts from
+    cell_share: float = setting(0.5, 0.1, 1.0)  # of a cell's pixels that must be measured
+    cell_sigmas: float = setting(1.6, 0.1, 100.0)  # a cell whose residual is more is not plane
+    join_sigmas: float = setting(6.0, 0.1, 100.0)  # deviation of two planes under their covariances
+    join_shift_sigmas: float = setting(0.4, 0.0, 100.0)  # and beyond it: of a pixel, how far joining may shift planes
+    pixel_sigmas: float = setting(3.0, 0.5, 100.0)  # of a pixel from its plane
+    min_area_share: float = setting(0.004, 0.0, 1.0)  # of the image
+    max_rms_sigmas: float = setting(1.6, 0.1, 100.0)  # residual beyond which a segment is not plane
+    max_bend_sigmas: float = setting(0.35, 0.0, 100.0)  # likewise, of the part that is a paraboloid
+    reliable_area_share: float = setting(0.01, 0.0, 1.0)  # of the image
+    reliable_angle_rad: float = setting(0.01, 1e-5, 1.0)  # standard deviation beyond which a segment is ambiguous
+    reliable_offset_m: float = setting(0.005, 1e-5, 1.0)  # likewise
+    reliable_cosine: float = setting(0.17, 0.0, 1.0)  # of the angle between normal and line of sight
     # Planar Gaussian Instances
     cell_m: float = setting(0.05, 0.005, 1.0)  # of the grid that holds the extent of a PGI
     max_angle_rad: float = setting(0.2, 0.01, 1.57)  # theta_max of Eq. 5
@@ -164,15 +179,12 @@ class PlanesConfig:
     bridge_m: float = setting(1.0, 0.0, 100.0)  # likewise across a gap that something in front of it hides
     pose_sigma_rad: float = setting(0.003, 0.0, 1.0)  # of a keyframe
     pose_sigma_m: float = setting(0.01, 1e-4, 1.0)  # of a keyframe
-    model_sigma_rad: float = setting(0.01, 1e-5, 1.0)  # real surfaces are not quite planes
-    model_sigma_m: float = setting(0.003, 1e-5, 1.0)  # likewise
+    model_sigma_m: float = setting(0.003, 1e-5, 1.0)  # real surfaces are not quite planes
     independent_views: int = setting(10, 1, 100_000)  # however many there are, they inform no more than so many
     observations: int = setting(256, 8, 100_000)  # kept of each PGI
     confirm_views: int = setting(3, 2, 1000)  # views that make an ambiguous segment a PGI
     candidate_keyframes: int = setting(10, 1, 100_000)  # in which it is not confirmed drop it
-    through_share: float = setting(
-        0.6, 0.1, 1.0
-    )  # of a PGI's visible extent that a view sees through speaks against it
+    through_share: float = setting(0.6, 0.1, 1.0)  # of a PGI seen through in a view speaks against it
     through_keyframes: int = setting(3, 1, 1000)  # that speak against a PGI, one after the other, remove it
     # Structure cue for keyframes (section 3.1)
     cue_angle_rad: float = setting(0.2, 0.0, 3.15)  # tau_theta
