@@ -245,6 +245,7 @@ def test_linearity_doubles_one_thing_at_a_time(render_result: dict[str, Any]) ->
     assert (pixels["gaussians_ratio"], pixels["pixels_ratio"]) == (1.0, pytest.approx(2.0, rel=0.05))
     for row in (gaussians, pixels):
         assert all(f"{direction}_ns_per_pair_percent" in row for direction in render.BLENDING)
+        assert "blend_ns_per_pair_percent" in row
 
 
 def test_render_as_tables(render_result: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:

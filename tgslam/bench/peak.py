@@ -21,19 +21,21 @@ class MultiplyAdd:
     def __init__(self, threads: int) -> None:
         """threads: that the kernels run on."""
         self.gflops = 0.0  # 10^9 additions and multiplications a second
-        self._x = runtime.zeros((_PARTS_PER_THREAD * threads, peak.CHAINS, peak.LANES), lanes=True)
+        self._x = runtime.zeros((_PARTS_PER_THREAD * threads, max(peak.CHAINS), peak.LANES), lanes=True)
         self._steps = 1
-        self._launch_s()  # compiles
-        while self._launch_s() < _LAUNCH_S:
+        for chains in peak.CHAINS:
+            self._launch_s(chains)  # compiles
+        while self._launch_s(peak.CHAINS[0]) < _LAUNCH_S:
             self._steps *= 2
 
     def sample(self) -> None:
         """Measure once more."""
-        flops = peak.FLOPS_PER_STEP * self._steps * self._x.shape[0]
-        self.gflops = max(self.gflops, flops / self._launch_s() / 1e9)
+        for chains in peak.CHAINS:
+            flops = peak.flops_per_step(chains) * self._steps * self._x.shape[0]
+            self.gflops = max(self.gflops, flops / self._launch_s(chains) / 1e9)
 
-    def _launch_s(self) -> float:
+    def _launch_s(self, chains: int) -> float:
         start = time.perf_counter()
-        peak.multiply_add(self._steps, 0.5, 0.25, self._x)
+        peak.multiply_add(self._steps, 0.5, 0.25, chains, self._x)
         runtime.wait()
         return time.perf_counter() - start

@@ -161,6 +161,8 @@ def _change(name: str, before: dict[str, Any], after: dict[str, Any]) -> dict[st
     for direction in BLENDING:
         for key in ("ns_per_pair", "blend_ns_per_pair"):
             result[f"{direction}_{key}_percent"] = 100.0 * (after[direction][key] / before[direction][key] - 1.0)
+    blended = [sum(case[direction]["blend_ns_per_pair"] for direction in BLENDING) for case in (before, after)]
+    result["blend_ns_per_pair_percent"] = 100.0 * (blended[1] / blended[0] - 1.0)
     return result
 
 

@@ -57,7 +57,7 @@ def print_render(result: dict[str, Any]) -> None:
         print()
         print_columns(
             f"linearity, {where}: change of the ns a pair, whole pass (blending alone)",
-            ("change", "slots", "pairs", "forward", "backward"),
+            ("change", "slots", "pairs", "forward", "backward", "blending, both"),
             [_linearity(row) for row in run["linearity"]],
         )
     if result["scaling"]:
@@ -147,7 +147,8 @@ def _linearity(row: dict[str, Any]) -> tuple[str, ...]:
         f"{row[f'{direction}_ns_per_pair_percent']:+.0f} % ({row[f'{direction}_blend_ns_per_pair_percent']:+.0f} %)"
         for direction in _DIRECTIONS
     )
-    return (row["change"], f"x {row['slots_ratio']:.2f}", f"x {row['pairs_ratio']:.2f}", *changes)
+    both = f"{row['blend_ns_per_pair_percent']:+.0f} %"
+    return (row["change"], f"x {row['slots_ratio']:.2f}", f"x {row['pairs_ratio']:.2f}", *changes, both)
 
 
 def _scaling(row: dict[str, Any], case: dict[str, Any]) -> tuple[str, ...]:
