@@ -6,8 +6,8 @@ from tgslam.kernels.simd import LANES, Lanes, lanes_kernel
 
 nd = ti.types.ndarray
 
-# Chains that do not depend on one another. Few of them leave the units waiting for each other's results; many do not fit
-# into the registers of a CPU whose vectors are short. The most that any number reaches is the peak.
+# Chains that do not depend on one another. Few of them leave the units waiting for each other's results; many do not
+# fit into the registers of a CPU whose vectors are short. The most that any number reaches is the peak.
 CHAINS = (6, 12)
 _THREAD_STEP = 512  # iterations that Taichi hands a thread at a time
 

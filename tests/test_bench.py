@@ -42,7 +42,7 @@ def run_json(*arguments: str) -> dict[str, Any]:
 
 def one_tile(qa: float) -> dict[str, Any]:
     """Arguments of the kernels for a tile with one round splat in its middle; qa: its fall-off, 1/px^2."""
-    splat, rows = LaneArray((1,)), LaneArray((1,))
+    splat, rows, groups = LaneArray((1,)), LaneArray((1,)), LaneArray((1,))
     columns = {
         projection.U: 7.5, projection.V: 7.5, projection.QA: qa, projection.QC: qa, projection.FADE: 1.0,
         projection.Z: 2.0, projection.INV_Z: 0.5, projection.RED: 0.5,
@@ -56,7 +56,7 @@ def one_tile(qa: float) -> dict[str, Any]:
     return {
         "tiles": 1, "tiles_x": 1, "start": np.array([0, 1]), "ids": np.zeros(1, int), "entry": np.zeros(1, int),
         "splat": splat, "rows": rows, "slot": rows.values, "mask": np.zeros(1, int),
-        "todo": np.zeros((PER_ROW, 1), int), "pixels": pixels,
+        "groups": groups, "hits": groups.values, "pixels": pixels,
         "with_embedding": False, "with_curvature": False,
         "colour": np.zeros(colours), "depth": np.zeros(image), "opacity": np.zeros(image),
         "embedding": np.zeros(colours), "g_colour": np.ones(colours), "g_depth": np.ones(image),
