@@ -260,6 +260,7 @@ def backward(
     """Moments of every splat; nothing of the forward pass is stored but the image and where each warp stopped.
 
     dL/dalpha_i = T_i (g . c_i) - (g . out - sum_{k <= i} w_k g . c_k) / (1 - alpha_i), zero where alpha saturates.
+    The warps add their sums in no fixed order, so that results repeat but for rounding.
     """
     ti.loop_config(block_dim=BLOCK)
     for i in range(tiles * BLOCK):
@@ -302,7 +303,7 @@ def backward(
                     dx, dy = px - batch[j, U], py - batch[j, V]
                     raw = alpha_before_cap(dx, dy, j, batch)
                     alpha = ti.min(raw, ALPHA_MAX)
-                    touched = alpha > ALPHA_MIN and T > 0.0
+                    touched = alpha > ALPHA_MIN
                     if ti.simt.warp.any_nonzero(ti.u32(ALL), ti.cast(touched, ti.i32)) != 0:
                         w, h, bend = 0.0, 0.0, 0.0
                         if touched:

@@ -117,6 +117,14 @@ def test_hidden_gaussians_change_neither_image_nor_gradients(devices: Devices, g
         np.testing.assert_array_equal(whole[name][by_depth[:count]], front[name], err_msg=name)
 
 
+def test_each_warp_stops_where_it_did_in_the_forward_pass(devices: Devices) -> None:
+    """Although others of its block go on."""
+    found, layers = devices.cuda(rasterizer.wall), rasterizer.WALL[0]
+    assert (found["opacity"][:, :8] > 1.0 - T_MIN).all() and (found["opacity"][:, 14:] < 0.99).all()
+    for name in (n for n in found if n.startswith("grad_")):
+        assert found[name][0].any() and not found[name][layers:].any(), name
+
+
 @pytest.mark.parametrize("grid", GRIDS)
 def test_memory_is_reused(devices: Devices, grid: Grid) -> None:
     fresh, reused = devices.cuda(rasterizer.render, grid), devices.cuda(rasterizer.render_twice, grid)

@@ -25,6 +25,7 @@ from tgslam.splatting.cpu import CpuSplatting
 from tgslam.types import Camera, Gaussians
 
 IMAGES = ("colour", "depth", "opacity", "embedding")
+WALL = (24, 20)  # layers of `wall`, sheets behind it
 _FRONT = 16  # sheets of the opaque stack that hide all others
 
 
@@ -172,6 +173,29 @@ def render_twice() -> dict[str, np.ndarray]:
     results = {name: runtime.to_host(getattr(images, name)) for name in IMAGES}
     results |= {f"grad_{name}": 0.5 * runtime.to_host(getattr(into, name)) for name in NAMES}
     return results | {"grad_pose": poses[1]}
+
+
+@scenario
+def wall() -> dict[str, np.ndarray]:
+    """Gradients of the left half of a tile, whose warps stop at a wall; those of the right half see far beyond it."""
+    layers, sheets = WALL
+    camera = Camera(16, 16, 20.0, 20.0, 7.5, 7.5)
+    depth_m = np.concatenate([np.linspace(1.0, 1.02, layers), np.linspace(1.5, 2.0, sheets)])
+    in_wall = depth_m < 1.1
+    gaussians = make_gaussians(
+        mean=np.column_stack([np.where(in_wall, -0.2, 0.0), np.zeros(layers + sheets), depth_m]),
+        log_scale=np.log(np.where(in_wall[:, None], [0.15, 9.0, 0.01], [9.0, 9.0, 0.01])),
+        opacity_logit=np.where(in_wall, 5.0, -4.0),
+    )
+    image = np.zeros((camera.height, camera.width), np.float32)
+    image[:, :8] = np.random.default_rng(8).normal(size=(camera.height, 8))
+    gradient = ImageGradient(*(runtime.to_device(g) for g in (np.repeat(image[..., None], 3, 2), image, image)))
+    gaussian_map, rasterizer = GaussianMap.from_gaussians(gaussians), Rasterizer(camera)
+    images = rasterizer.forward(gaussian_map, np.eye(4))
+    into = MapGradient.zeros(gaussian_map.capacity)
+    rasterizer.backward(gaussian_map, gradient, into)
+    results = {f"grad_{name}": runtime.to_host(getattr(into, name)) for name in NAMES if name != "embedding"}
+    return results | {"opacity": runtime.to_host(images.opacity)}
 
 
 def _image_gradient(scene: Scene, with_embedding: bool, with_curvature: bool) -> ImageGradient:
