@@ -1,4 +1,4 @@
-"""Image kernels: luminance, 2x2 halving, Sobel gradients, the texture gate, normals from depth, records for alignment.
+"""Image kernels: luminance, 2x2 halving, Sobel gradients, the texture gate, records for alignment.
 
 A parallel loop of up to 512 iterations runs on one thread, so each row is cut into SPLIT segments of columns.
 Every output has one writer.
@@ -18,7 +18,6 @@ from tgslam.kernels.alignment import (
     LIVE_GX,
     LIVE_GY,
     LIVE_STRENGTH,
-    MODEL_DEPTH,
 )
 from tgslam.kernels.simd import LANES
 
@@ -307,105 +306,3 @@ def gate(
         i, begin, end = segment(s, magnitude.shape[1])
         for j in range(begin, end):
             out[i, j] = 1.0 - ti.min(ti.max((magnitude[i, j] - low) * inverse_range, 0.0), 1.0)
-
-
-@ti.kernel
-def inverse_depth_blocks(
-    depth: F2,  # [H, W] m, 0 = none
-    relative: ti.f32,
-    blocks: F2,  # [H // 2, W // 2] 1/m, 0 = none, out
-):
-    """Mean inverse depth of the nearest surface in each 2x2 block."""
-    for s in range(blocks.shape[0] * SPLIT):
-        i, begin, end = segment(s, blocks.shape[1])
-        for j in range(begin, end):
-            nearest = 0.0
-            for k in ti.static(range(4)):
-                z = depth[2 * i + k // 2, 2 * j + k % 2]
-                nearest = ti.max(nearest, ti.select(z > 0.0, 1.0 / ti.max(z, 1e-6), 0.0))
-            total = 0.0
-            count = 0.0
-            for k in ti.static(range(4)):
-                z = depth[2 * i + k // 2, 2 * j + k % 2]
-                w = 1.0 / ti.max(z, 1e-6)
-                keep = ti.select((z > 0.0) and (w >= nearest * (1.0 - relative)), 1.0, 0.0)
-                total += keep * w
-                count += keep
-            blocks[i, j] = total / ti.max(count, 1.0)
-
-
-@ti.func
-def fit_block(blocks: ti.template(), i, j, radius: ti.template(), noise, slope):
-    """Least squares w(x, y) = w0 + wx x + wy y over the like neighbours of block (i, j).
-
-    Returns (w0, wx, wy, mean squared residual), x and y in blocks, w in 1/m; w0 = 0 when there is no fit.
-    """
-    centre = blocks[i, j]
-    n, sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    sw, sxw, syw, sww = 0.0, 0.0, 0.0, 0.0
-    for y in ti.static(range(-radius, radius + 1)):
-        r = ti.min(ti.max(i + y, 0), blocks.shape[0] - 1)
-        row_n, row_x, row_w, row_xw = 0.0, 0.0, 0.0, 0.0
-        for x in ti.static(range(-radius, radius + 1)):
-            c = ti.min(ti.max(j + x, 0), blocks.shape[1] - 1)
-            w = blocks[r, c]
-            near = ti.abs(w - centre) <= noise + slope * centre * max(abs(x), abs(y))
-            like = ti.select(w > 0.0 and near and r == i + y and c == j + x, 1.0, 0.0)
-            d = like * (w - centre)
-            row_n += like
-            row_x += x * like
-            row_w += d
-            row_xw += x * d
-            sxx += (x * x) * like
-            sww += d * d
-        n, sx, sy, sw = n + row_n, sx + row_x, sy + row_n * y, sw + row_w
-        sxy, syy, sxw, syw = sxy + row_x * y, syy + row_n * (y * y), sxw + row_xw, syw + row_w * y
-    mean = 1.0 / ti.max(n, 1.0)
-    cxx, cxy, cyy = sxx - sx * sx * mean, sxy - sx * sy * mean, syy - sy * sy * mean
-    cxw, cyw, cww = sxw - sx * sw * mean, syw - sy * sw * mean, sww - sw * sw * mean
-    det = cxx * cyy - cxy * cxy
-    result = ti.Vector([0.0, 0.0, 0.0, 0.0])
-    enough = ti.cast((2 * radius + 1) * (2 * radius + 1), ti.f32) * 0.3
-    if centre > 0.0 and n >= ti.max(enough, 4.0) and det > 1e-3 * cxx * cyy:
-        wx, wy = (cyy * cxw - cxy * cyw) / det, (cxx * cyw - cxy * cxw) / det
-        w0 = centre + (sw - wx * sx - wy * sy) * mean
-        result = ti.Vector([w0, wx, wy, ti.max(cww - wx * cxw - wy * cyw, 0.0) * mean])
-    return result
-
-
-@ti.kernel
-def normals(
-    depth: F2,  # [H, W] m, 0 = none
-    blocks: F2,  # [H // 2, W // 2] 1/m
-    fx: ti.f32,
-    fy: ti.f32,
-    cx: ti.f32,
-    cy: ti.f32,
-    radius: ti.template(),  # blocks
-    sigma: ti.f32,  # standard deviation of inverse depth, 1/m
-    steepest: ti.f32,  # tangent of the largest angle between normal and optical axis that may be joined
-    with_depth: ti.template(),
-    out: F3,  # [H, W, 3] camera frame, towards the camera, out; with_depth: [H, W, 4], and the depth in m
-):
-    """Normals from plane fits of inverse depth, one fit a 2x2 block, given to the pixels that lie on the fit."""
-    for s in range(blocks.shape[0] * SPLIT):
-        i, begin, end = segment(s, blocks.shape[1])
-        slope = 2.0 * steepest / ti.min(fx, fy)
-        for j in range(begin, end):
-            fit = fit_block(blocks, i, j, radius, 4.0 * sigma, slope)
-            w0, a, b = fit[0], 0.5 * fit[1], 0.5 * fit[2]  # per pixel from here on
-            u, v = 2.0 * j + 0.5, 2.0 * i + 0.5
-            nx, ny, nz = a * fx, b * fy, w0 - a * (u - cx) - b * (v - cy)
-            length = ti.sqrt(nx * nx + ny * ny + nz * nz)
-            good = (w0 > 0.0) and (fit[3] <= 4.0 * sigma * sigma + 1e-5 * w0 * w0)
-            for r in range(2 * i, ti.select(i + 1 < blocks.shape[0], 2 * i + 2, depth.shape[0])):
-                for c in range(2 * j, ti.select(j + 1 < blocks.shape[1], 2 * j + 2, depth.shape[1])):
-                    z = depth[r, c]
-                    expected = w0 + a * (c - u) + b * (r - v)
-                    near = ti.abs(1.0 / ti.max(z, 1e-6) - expected) <= 4.0 * sigma + 0.01 * w0
-                    scale = ti.select(good and (z > 0.0) and near, -1.0 / ti.max(length, 1e-12), 0.0)
-                    out[r, c, 0] = nx * scale
-                    out[r, c, 1] = ny * scale
-                    out[r, c, 2] = nz * scale
-                    if ti.static(with_depth):
-                        out[r, c, MODEL_DEPTH] = ti.select(z > 0.0 and z < FAR_M, z, 0.0)

@@ -11,6 +11,8 @@ from tgslam import runtime
 from tgslam.arrays import require
 from tgslam.kernels import alignment
 from tgslam.kernels import image as kernels
+from tgslam.kernels import normals as fitting
+from tgslam.kernels.cuda import normals as cuda_fitting
 from tgslam.types import Camera
 
 STEEPEST_RAD = 1.3  # between a surface's normal and the optical axis
@@ -148,35 +150,37 @@ def normals(
     require("depth_m", depth_m, (camera.height, camera.width))
     height, width = depth_m.shape
     out = _output(out, (height, width, 3))
-    blocks = runtime.empty(_halved(depth_m.shape))
-    _fit_normals(depth_m, camera, radius, sigma_per_m2, steepest_rad, blocks, out)
+    PlaneFits(camera, radius, sigma_per_m2, steepest_rad).write(depth_m, out)
     return out
 
 
-def surface(
-    depth_m: np.ndarray, camera: Camera, radius: int, sigma_per_m2: float, blocks: np.ndarray, out: np.ndarray
-) -> None:
-    """Write `normals` and the depth side by side: out float32 [H, W, 4]. blocks: scratch [H // 2, W // 2]."""
-    require("depth_m", depth_m, (camera.height, camera.width))
-    require("blocks", blocks, _halved(depth_m.shape))
-    require("out", out, (*depth_m.shape, alignment.SURFACE))
-    _fit_normals(depth_m, camera, radius, sigma_per_m2, STEEPEST_RAD, blocks, out)
+class PlaneFits:
+    """`normals` for images of one size, with the scratch memory for it."""
 
+    def __init__(self, camera: Camera, radius: int, sigma_per_m2: float, steepest_rad: float = STEEPEST_RAD) -> None:
+        if not 1 <= radius <= fitting.MARGIN:
+            raise ValueError(f"radius must be from 1 to {fitting.MARGIN} blocks, but is {radius}")
+        height, width = _halved((camera.height, camera.width))
+        vectors = -(-width // fitting.LANES)
+        self.camera, self._radius = camera, radius
+        self._settings = runtime.to_device(
+            [camera.fx, camera.fy, camera.cx, camera.cy, sigma_per_m2, math.tan(steepest_rad)]
+        )
+        self._blocks = runtime.zeros((height + 2 * fitting.MARGIN, vectors + 2, fitting.LANES))
+        self._fits = runtime.empty((height, vectors, fitting.FIT, fitting.LANES))
 
-def _fit_normals(
-    depth_m: np.ndarray,
-    camera: Camera,
-    radius: int,
-    sigma_per_m2: float,
-    steepest_rad: float,
-    blocks: np.ndarray,
-    out: np.ndarray,
-) -> None:
-    kernels.inverse_depth_blocks(depth_m, DEPTH_EDGE, blocks)
-    kernels.normals(
-        depth_m, blocks, camera.fx, camera.fy, camera.cx, camera.cy, radius, sigma_per_m2, math.tan(steepest_rad),
-        out.shape[2] == alignment.SURFACE, out,
-    )  # fmt: skip
+    def write(self, depth_m: np.ndarray, out: np.ndarray) -> None:
+        """Normals of float32 [H, W] into out [H, W, 3], or [H, W, 4] with the depth beside them."""
+        with_depth = out.shape[2] == alignment.SURFACE
+        require("depth_m", depth_m, (self.camera.height, self.camera.width))
+        require("out", out, (*depth_m.shape, alignment.SURFACE if with_depth else 3))
+        fitting.inverse_depth_blocks(depth_m, DEPTH_EDGE, self._blocks)
+        if runtime.device() is runtime.Device.CUDA:
+            least = fitting.least_count(self._radius)
+            cuda_fitting.fit_planes(self._settings, self._blocks, self._radius, least, self._fits)
+        else:
+            fitting.fit_planes(self._settings, self._blocks, self._radius, self._fits)
+        fitting.spread_normals(self._settings, depth_m, self._fits, with_depth, out)
 
 
 def _percentile(ordered: NDArray[np.float32], percentile: float) -> float:

@@ -72,9 +72,9 @@ class ModelPyramid:
 
     def __init__(self, camera: Camera, first: int, levels: int, loss: LossConfig, min_opacity: float) -> None:
         """min_opacity: pixels that the map covers no more than that are left out."""
-        self.loss, self.min_opacity, self._images = loss, min_opacity, _ImagePyramid(camera, first, levels)
+        self.min_opacity, self._images = min_opacity, _ImagePyramid(camera, first, levels)
         self.levels = [_model_level(camera.halved(first + level)) for level in range(levels)]
-        self._blocks = [runtime.empty((level.camera.height // 2, level.camera.width // 2)) for level in self.levels]
+        self._fits = [images.PlaneFits(level.camera, _NORMAL_RADIUS, loss.depth_sigma_per_m2) for level in self.levels]
 
     def update(self, rendered: RenderImages) -> list[ModelLevel]:
         """Take in a rendering at full size; the result is valid until the next one."""
@@ -82,12 +82,10 @@ class ModelPyramid:
         images.reduce_rendering(
             rendered.colour, rendered.depth, rendered.opacity, self.min_opacity, base.grey, base.depth
         )
-        for level, pair, blocks in zip(self.levels, self._images.halvings(), self._blocks, strict=True):
+        for level, pair, fits in zip(self.levels, self._images.halvings(), self._fits, strict=True):
             kernels.pack_texture(pair.grey, level.texture)
             kernels.pack_second_derivatives(level.texture)
-            images.surface(
-                pair.depth, level.camera, _NORMAL_RADIUS, self.loss.depth_sigma_per_m2, blocks, level.surface
-            )
+            fits.write(pair.depth, level.surface)
         return self.levels
 
 
