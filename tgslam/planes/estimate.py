@@ -93,13 +93,13 @@ def from_segments(segments: Sequence[PlaneSegment]) -> PlaneEstimate:
 
 def stacked(planes: Sequence[PlaneEstimate]) -> PlaneEstimate:
     """Single planes of one frame as an array [N]."""
-    return PlaneEstimate(
-        np.stack([p.normal for p in planes]),
-        np.stack([p.offset_m for p in planes]),
-        np.stack([p.centroid for p in planes]),
-        np.stack([p.axes for p in planes]),
-        np.stack([p.covariance for p in planes]),
-    )
+    return PlaneEstimate(*(np.stack(parts) for parts in zip(*(vars(p).values() for p in planes), strict=True)))
+
+
+def concatenated(first: PlaneEstimate, second: PlaneEstimate) -> PlaneEstimate:
+    """Two arrays of planes one after the other."""
+    pairs = zip(vars(first).values(), vars(second).values(), strict=True)
+    return PlaneEstimate(*(np.concatenate(pair) for pair in pairs))
 
 
 def deviation_sigmas(planes: PlaneEstimate, reference: PlaneEstimate) -> Vector:

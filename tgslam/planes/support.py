@@ -145,6 +145,6 @@ def _lookup(grid: NDArray[np.uint8], index: Cells) -> NDArray[np.bool_]:
     """Where grid[index] > 0, for index [N, 2]; False outside the grid."""
     if grid.size == 0:
         return np.zeros(len(index), bool)
-    inside = ((index >= 0) & (index < grid.shape)).all(axis=1)
+    inside: NDArray[np.bool_] = np.all((index >= 0) & (index < grid.shape), axis=1)
     clipped = np.where(inside[:, None], index, 0)
     return inside & (grid[clipped[:, 0], clipped[:, 1]] > 0)

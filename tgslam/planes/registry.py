@@ -1,0 +1,210 @@
+"""The set of Planar Gaussian Instances: how they begin, grow, merge, split and end (section 3.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tgslam.config.schema import PlanesConfig
+from tgslam.geometry import inverse
+from tgslam.planes.association import gate
+from tgslam.planes.estimate import PlaneEstimate, stacked
+from tgslam.planes.instance import NO_ID, PlanarInstance, Poses
+from tgslam.planes.matching import ViewMatching, same_surface
+from tgslam.planes.segment import PlaneView
+from tgslam.planes.sight import Samples, Sight, Tolerance
+from tgslam.types import Camera, FloatImage
+
+_LEAST_SAMPLES = 12  # of a plane's extent in view, for the view to say something against it
+_SUSPECT_PLANES = 3  # so many contradicted at once, and more than confirmed: the pose is wrong, not the planes
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What a keyframe's planes are, and what became of the instances."""
+
+    keyframe: int
+    ids: NDArray[np.int32]  # [S] PGI of each segment; -1 = deferred
+    created: tuple[int, ...]  # PGIs that this keyframe made or confirmed
+    merged: tuple[tuple[int, int], ...]  # (kept, absorbed)
+    removed: tuple[int, ...]
+
+    def id_image(self, labels: NDArray[np.int32]) -> NDArray[np.int32]:
+        """The PGI of each pixel [H, W], -1 = none, for the labels of the PlaneView: id(u) of Eq. 2."""
+        return np.append(self.ids, np.int32(NO_ID))[labels]
+
+
+class PlaneRegistry:
+    """All PGIs of a run. Ids count up from 0 and are never used again.
+
+    A reliable segment that matches nothing is a PGI at once. An ambiguous one is a candidate: it becomes a PGI, with
+    its first keyframe, when further views or a reliable segment confirm it, and is dropped when they do not.
+    """
+
+    def __init__(self, config: PlanesConfig, depth_sigma_per_m2: float) -> None:
+        """depth_sigma_per_m2: the sensor's noise, sigma_z = this * z^2."""
+        self._config = config
+        self._tolerance = Tolerance(config.gate_sigmas, depth_sigma_per_m2, config.pose_sigma_rad, config.pose_sigma_m)
+        self._instances: list[PlanarInstance] = []  # candidates included, oldest first
+        self._poses: dict[int, NDArray[np.float64]] = {}  # keyframe -> T_wc [4, 4]
+        self._absorbed_by: dict[int, int] = {}
+        self._next_id = 0
+
+    @property
+    def instances(self) -> dict[int, PlanarInstance]:
+        """The PGIs by id, ascending. Candidates are not among them."""
+        return {i.id: i for i in sorted(self._instances, key=lambda instance: instance.id) if i.id != NO_ID}
+
+    @property
+    def candidate_count(self) -> int:
+        """Ambiguous surfaces that wait for further views."""
+        return sum(instance.id == NO_ID for instance in self._instances)
+
+    def resolve(self, plane_id: int) -> int:
+        """The id under which a PGI lives on after merges; -1 for one that was removed."""
+        while plane_id in self._absorbed_by:
+            plane_id = self._absorbed_by[plane_id]
+        return plane_id if any(instance.id == plane_id for instance in self._instances) else NO_ID
+
+    def seen_from(self, keyframe: int) -> dict[int, PlaneEstimate]:
+        """The PGIs that a keyframe saw, by id, each as it saw it: in its camera's frame."""
+        views = {i: instance.view(keyframe) for i, instance in self.instances.items() if keyframe in instance.keyframes}
+        return {i: view for i, view in views.items() if view is not None}
+
+    def observe(
+        self, view: PlaneView, depth_m: FloatImage, camera: Camera, T_cw: NDArray[np.float64], keyframe: int
+    ) -> Observation:
+        """Match a keyframe's planes to the PGIs, and let them grow, begin, merge, split and end.
+
+        depth_m: [H, W] m on the host, as the view was made from. keyframe: a number that grows from call to call.
+        """
+        self._poses[keyframe] = inverse(T_cw)
+        samples = Samples.of(view, depth_m, camera, T_cw, self._config.mask_width_px)
+        matching = ViewMatching(samples, self._instances, self._config, self._tolerance)
+        self._match(matching, keyframe)
+        seen = self._integrate(matching, keyframe)
+        created = self._confirm(seen, matching)
+        removed = self._weigh_contradictions(matching, seen)
+        created += self._split(seen)
+        merged = self._merge(seen)
+        ids = [self._id_of(owner, keyframe) for owner in matching.owner]
+        return Observation(keyframe, np.array(ids, np.int32), tuple(created), tuple(merged), tuple(removed))
+
+    def moved(self, corrections: Poses) -> tuple[tuple[int, int], ...]:
+        """Keyframes have moved in the world: p_w <- corrections[keyframe] p_w, [4, 4] each; the others stay.
+
+        PGIs are computed again from their keyframes' views. Returns merges (kept, absorbed) of those that now coincide.
+        """
+        for keyframe, correction in corrections.items():
+            if keyframe in self._poses:
+                self._poses[keyframe] = correction @ self._poses[keyframe]
+        affected = [i for i in self._instances if any(k in corrections for k in i.keyframes)]
+        for instance in affected:
+            instance.move(corrections, self._poses)
+        return tuple(self._merge(affected))
+
+    def _match(self, matching: ViewMatching, keyframe: int) -> None:
+        """Give every segment its instance; new ones for those that neither overlap nor continue one that there is."""
+        for segment, instance in matching.overlapping():
+            matching.give(segment, instance, keyframe)
+        for segment in range(len(matching.segments)):
+            if matching.owner[segment] is None:
+                found = matching.continued(segment)
+                matching.give(segment, found or PlanarInstance(matching.world[segment], self._config), keyframe)
+
+    def _integrate(self, matching: ViewMatching, keyframe: int) -> list[PlanarInstance]:
+        """Hand each instance its view; returns the instances in view, oldest first."""
+        seen = [instance for instance in matching.instances if matching.pieces(instance)]
+        for instance in seen:
+            instance.add_view(keyframe, *matching.combined(matching.pieces(instance)), self._poses)
+        self._instances = matching.instances
+        return seen
+
+    def _confirm(self, seen: list[PlanarInstance], matching: ViewMatching) -> list[int]:
+        """Candidates that have become PGIs. The others that were not seen come nearer to their end."""
+        created = []
+        for instance in seen:
+            reliable = any(matching.segments[piece].reliable for piece in matching.pieces(instance))
+            if instance.id == NO_ID and (reliable or len(instance.keyframes) >= self._config.confirm_views):
+                created.append(self._name(instance))
+        for instance in self._instances:
+            if instance.id == NO_ID and instance not in seen:
+                instance.missed += 1
+                if instance.missed > self._config.candidate_keyframes:
+                    self._instances = [i for i in self._instances if i is not instance]
+        return created
+
+    def _weigh_contradictions(self, matching: ViewMatching, seen: list[PlanarInstance]) -> list[int]:
+        """Take back what the view sees through; the ids of PGIs of which nothing is left, or no view speaks for."""
+        sights = [(matching.instances[i], s) for i, s in matching.sights.items()]
+        against = [instance for instance, s in sights if instance not in seen and self._contradicts(s)]
+        if len(against) >= max(_SUSPECT_PLANES, len(seen) + 1):
+            return []
+        for instance, view in sights:
+            instance.support.weaken(view.through_cells)
+            if instance in against:
+                instance.through += 1
+            elif len(view.shown) >= _LEAST_SAMPLES:
+                instance.through = 0
+        ended = [i for i in self._instances if self._is_refuted(i)]
+        self._instances = [i for i in self._instances if i not in ended]
+        return [instance.id for instance in ended if instance.id != NO_ID]
+
+    def _contradicts(self, view: Sight) -> bool:
+        visible = view.through_count + len(view.shown)
+        return visible >= _LEAST_SAMPLES and view.through_share >= self._config.through_share
+
+    def _is_refuted(self, instance: PlanarInstance) -> bool:
+        """One view that sees through it is enough against a candidate."""
+        limit = 1 if instance.id == NO_ID else self._config.through_keyframes
+        return instance.through >= limit or len(instance.support) == 0
+
+    def _split(self, seen: list[PlanarInstance]) -> list[int]:
+        """Instances that turn out to be two surfaces become two; the ids of the new ones."""
+        parts = [part for instance in seen if (part := instance.split(self._poses)) is not None]
+        self._instances += parts
+        return [self._name(part) for part in parts]
+
+    def _merge(self, touched: list[PlanarInstance]) -> list[tuple[int, int]]:
+        """Make one of each pair of instances that turn out to be the same surface; (kept, absorbed) of PGIs."""
+        merged = []
+        for instance in touched:
+            while instance in self._instances and (other := self._twin(instance)) is not None:
+                # A PGI before a candidate, then the older one
+                kept, absorbed = sorted((instance, other), key=lambda i: (i.id == NO_ID, i.id, i.keyframes[0]))
+                kept.absorb(absorbed, self._poses)
+                self._instances = [i for i in self._instances if i is not absorbed]
+                if absorbed.id != NO_ID:
+                    self._absorbed_by[absorbed.id] = kept.id
+                    merged.append((kept.id, absorbed.id))
+                instance = kept
+        return merged
+
+    def _twin(self, instance: PlanarInstance) -> PlanarInstance | None:
+        """Another instance that is the same surface, judged from either one's centroid."""
+        others = [i for i in self._instances if i is not instance]
+        if not others:
+            return None
+        config = self._config
+        planes = stacked([i.plane for i in others]).widened(config.pose_sigma_rad, config.pose_sigma_m)
+        position = instance.centroid_w
+        admitted = gate(planes, instance.plane, position, config).admitted
+        admitted &= gate(instance.plane, planes, position, config).admitted
+        twins = (others[i] for i in np.flatnonzero(admitted) if same_surface(instance, others[i], config))
+        return next(twins, None)
+
+    def _name(self, instance: PlanarInstance) -> int:
+        instance.id = self._next_id
+        self._next_id += 1
+        return instance.id
+
+    def _id_of(self, owner: PlanarInstance | None, keyframe: int) -> int:
+        """The id of a segment's instance after this keyframe's merges and splits."""
+        if owner is None or owner.id == NO_ID:
+            return NO_ID
+        if keyframe in owner.keyframes:
+            return self.resolve(owner.id)
+        parts = [i.id for i in self._instances if keyframe in i.keyframes and i.id > owner.id]
+        return parts[-1] if parts else NO_ID
