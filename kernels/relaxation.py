@@ -22,9 +22,10 @@ def relax(
     weight: ti.f32,  # see `pixel_curvature`: that much is added to the curvature, so that little evidence moves little
     colour: nd(ti.f32, ndim=2),  # [N, 3] changed, kept in [0, 1]
 ):
-    """One relaxation step of the visible Gaussians' colours."""
+    """One relaxation step of the visible Gaussians' colours; none without curvature, as of a loss of other terms."""
     for i in range(count):
-        if visible[i] != 0:
-            per_colour = step / (curvature[i, 0] + pixel_curvature(totals, weight))
+        whole = curvature[i, 0] + pixel_curvature(totals, weight)
+        if visible[i] != 0 and whole > 0.0:
+            per_colour = step / whole
             for c in ti.static(range(3)):
                 colour[i, c] = ti.min(ti.max(colour[i, c] - per_colour * grad_colour[i, c], 0.0), 1.0)

@@ -8,6 +8,8 @@ F1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
 F2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
 I1 = ti.types.ndarray(dtype=ti.i32, ndim=1)
 
+ENOUGH_PX = 1e9  # more than any image has pixels
+
 
 @ti.func
 def pixel_curvature(totals: ti.template(), weight):
@@ -53,8 +55,13 @@ def record_view(
     contribution: F1,  # [N] px, the most blend weight that any view gave the row, in and out
     views: I1,  # [N] views that had the row in sight, in and out
 ):
-    """Count a view, and what each row contributed to its pixels, badly rendered ones less than well rendered ones."""
+    """Count a view, and what each row contributed to its pixels, badly rendered ones less than well rendered ones.
+
+    A loss without the intensity term cannot tell: whatever is in sight contributes enough.
+    """
     for i in range(rows):
         if visible[i] != 0:
-            contribution[i] = ti.max(contribution[i], curvature[i, 0] / pixel_curvature(totals, weight))
+            pixel = pixel_curvature(totals, weight)
+            weight_px = ti.select(pixel > 0.0, curvature[i, 0] / ti.max(pixel, 1e-30), ENOUGH_PX)
+            contribution[i] = ti.max(contribution[i], weight_px)
             views[i] += 1

@@ -69,6 +69,12 @@ def test_no_gradient_moves_nothing_even_with_hardly_any_curvature():
     np.testing.assert_array_equal(found, np.float32(colour))
 
 
+def test_a_loss_without_curvature_leaves_colours_alone():
+    visible, grad_colour, w_colour, colour = case(20)
+    found = relax(np.ones_like(visible), grad_colour, 0 * w_colour, colour, floor=0.0)
+    np.testing.assert_array_equal(found, np.float32(colour))
+
+
 def one_gaussian():
     """A map of one big Gaussian that faces the camera."""
     return GaussianMap.from_gaussians(

@@ -12,11 +12,11 @@ from tgslam.mapping.sightings import Sightings
 WEIGHT = 5.0  # of the intensity term over three times its Charbonnier epsilon
 
 
-def record(sightings: Sightings, visible: NDArray, curvature: NDArray, pixels: float) -> None:
+def record(sightings: Sightings, visible: NDArray, curvature: NDArray, pixels: float, weight: float = WEIGHT) -> None:
     both = np.stack([curvature, np.full_like(curvature, 1e9)], axis=1)  # the depth's column must not matter
     totals = np.zeros(TOTALS)
     totals[PIXELS] = pixels
-    sightings.record(runtime.to_device(visible, np.int32), runtime.to_device(both), runtime.to_device(totals), WEIGHT)
+    sightings.record(runtime.to_device(visible, np.int32), runtime.to_device(both), runtime.to_device(totals), weight)
 
 
 def test_the_most_of_any_view_is_kept_and_only_views_in_sight_count() -> None:
@@ -40,6 +40,14 @@ def test_a_view_without_pixels_leaves_finite_numbers() -> None:
     record(sightings, np.ones(3), np.zeros(3), 0.0)
     np.testing.assert_array_equal(sightings.contribution, 0.0)
     np.testing.assert_array_equal(sightings.views, 1)
+
+
+def test_a_loss_without_an_intensity_term_finds_everything_in_sight_useful() -> None:
+    sightings = Sightings()
+    sightings.append(2)
+    record(sightings, np.array([1, 0]), np.zeros(2), 100.0, weight=0.0)
+    assert sightings.contribution[0] > 1e6
+    assert sightings.contribution[1] == 0.0
 
 
 def test_rows_keep_their_record_when_others_come_and_go() -> None:
