@@ -24,17 +24,3 @@ def tangent_depth(step, z, inv_z):
     camera.
     """
     return z + step * (1.0 + step * inv_z)
-
-
-@ti.func
-def least_exponent(xa, ya, xb, yb, a, b, c):
-    """Least a x^2 + b x y + c y^2 over the rectangle [xa, xb] x [ya, yb]; the form is positive.
-
-    It is taken where one of the two lines of the rectangle nearest to the origin comes nearest to it in that metric.
-    """
-    x, y = ti.min(ti.max(xa, 0.0), xb), ti.min(ti.max(ya, 0.0), yb)
-    y_at_x = ti.min(ti.max((-0.5 * b / c) * x, ya), yb)
-    x_at_y = ti.min(ti.max((-0.5 * b / a) * y, xa), xb)
-    on_column = (a * x + b * y_at_x) * x + c * y_at_x * y_at_x
-    on_row = (a * x_at_y + b * y) * x_at_y + c * y * y
-    return ti.min(on_column, on_row)
