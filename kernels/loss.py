@@ -22,6 +22,7 @@ from tgslam.kernels.objective import (
     INNER,
     L1,
     LUMA,
+    MOMENTS,
     PIXELS,
     RADIUS,
     SSIM,
@@ -43,8 +44,6 @@ L3 = ti.types.ndarray(dtype=Lanes, ndim=3)
 ROW_SPREAD = 64  # a loop over rows counts in steps of this: Taichi hands a thread 512 iterations at a time, so 8 rows
 LANE = tuple(float(k) for k in range(LANES))
 LUMA_PARTS = tuple(tuple(LUMA[(LANES * part + k) % 3] for k in range(LANES)) for part in range(3))
-MOMENTS = 3  # fields under the SSIM window: x, x^2, x y
-SLOPES = MOMENTS + 2  # derivatives by them, and by the two Sobel responses
 
 
 @ti.func

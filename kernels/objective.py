@@ -14,6 +14,8 @@ C1, C2 = 0.01**2, 0.03**2  # the usual SSIM constants for intensities in [0, 1]
 LUMA = (0.299, 0.587, 0.114)
 _BELL = [math.exp(-0.5 * (k / SIGMA) ** 2) for k in range(-RADIUS, RADIUS + 1)]
 TAPS = tuple(tap / sum(_BELL) for tap in _BELL)
+MOMENTS = 3  # fields under the SSIM window: x, x^2, x y
+SLOPES = MOMENTS + 2  # derivatives by them, and by the two Sobel responses
 
 # Sums over the image: M, M inside the border, M_d, then weighted penalties and derivatives by gain and bias
 PIXELS, INNER, DEPTHS, SSIM, GRAD, L1, GAIN, BIAS, GEO = range(9)

@@ -17,6 +17,7 @@ from tgslam.kernels.objective import (
     INNER,
     L1,
     LUMA,
+    MOMENTS,
     PIXELS,
     RADIUS,
     SSIM,
@@ -32,9 +33,6 @@ from tgslam.kernels.objective import (
 F1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
 F2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
 F3 = ti.types.ndarray(dtype=ti.f32, ndim=3)
-
-MOMENTS = 3  # fields under the SSIM window: x, x^2, x y
-SLOPES = MOMENTS + 2  # derivatives by them, and by the two Sobel responses
 
 
 def threads_for(height: int, width: int) -> int:

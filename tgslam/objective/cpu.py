@@ -7,7 +7,7 @@ import numpy as np
 from tgslam import runtime
 from tgslam.config.schema import LossConfig
 from tgslam.kernels import loss as kernels
-from tgslam.kernels.objective import STRUCTURE, TOTALS
+from tgslam.kernels.objective import MOMENTS, SLOPES, STRUCTURE, TOTALS
 from tgslam.kernels.simd import LANES
 from tgslam.objective.images import LossImages, PreparedObservation
 
@@ -31,7 +31,7 @@ def observe(colour: np.ndarray, depth: np.ndarray, mask: np.ndarray, gate: np.nd
         statistics=runtime.zeros((height, blocks, 2, LANES)),
     )
     kernels.observe_luma(width, result.colour, result.gate, result.luma, result.texture)
-    column = runtime.zeros((height, blocks + 2, kernels.MOMENTS, LANES))
+    column = runtime.zeros((height, blocks + 2, MOMENTS, LANES))
     kernels.observe_statistics(result.luma, column, result.statistics)
     return result
 
@@ -45,9 +45,9 @@ class CpuObjective:
         self._x = runtime.empty((height, blocks, LANES))
         self._weight = runtime.empty((height, blocks, LANES))
         # Zero beyond the image and in the border rows, where kernels never write
-        self._column = runtime.zeros((height, blocks + 2, kernels.MOMENTS, LANES))
-        self._slope = runtime.zeros((height, blocks + 2, kernels.SLOPES, LANES))
-        self._field = runtime.zeros((height, blocks, kernels.SLOPES, LANES))
+        self._column = runtime.zeros((height, blocks + 2, MOMENTS, LANES))
+        self._slope = runtime.zeros((height, blocks + 2, SLOPES, LANES))
+        self._field = runtime.zeros((height, blocks, SLOPES, LANES))
         self._partial = runtime.zeros((height, TOTALS))
         self._totals = runtime.empty((TOTALS,))
         self._g_colour = runtime.empty((height, 3 * blocks, LANES))

@@ -8,7 +8,7 @@ from tgslam import runtime
 from tgslam.config.schema import LossConfig
 from tgslam.kernels.cuda import loss as kernels
 from tgslam.kernels.cuda.warp import WARP
-from tgslam.kernels.objective import STRUCTURE, TOTALS
+from tgslam.kernels.objective import MOMENTS, SLOPES, STRUCTURE, TOTALS
 from tgslam.objective.images import LossImages, PreparedObservation
 
 
@@ -26,7 +26,7 @@ def observe(colour: np.ndarray, depth: np.ndarray, mask: np.ndarray, gate: np.nd
         statistics=runtime.zeros((2, height, width)),
     )
     kernels.observe_luma(threads, colour, gate, result.luma, result.texture)
-    column = runtime.empty((kernels.MOMENTS, height, width))
+    column = runtime.empty((MOMENTS, height, width))
     kernels.blur_columns(threads, result.luma, result.luma, column)
     kernels.observe_statistics(threads, column, result.statistics)
     return result
@@ -38,10 +38,10 @@ class CudaObjective:
     def __init__(self, height: int, width: int) -> None:
         self._threads = kernels.threads_for(height, width)
         self._x, self._weight = runtime.empty((height, width)), runtime.empty((height, width))
-        self._column = runtime.empty((kernels.MOMENTS, height, width))
+        self._column = runtime.empty((MOMENTS, height, width))
         # Zero in the border, where kernels never write
-        self._slope = runtime.zeros((kernels.SLOPES, height, width))
-        self._field = runtime.zeros((kernels.SLOPES, height, width))
+        self._slope = runtime.zeros((SLOPES, height, width))
+        self._field = runtime.zeros((SLOPES, height, width))
         self._partial = runtime.empty((TOTALS, self._threads // WARP))
         self._result = LossImages(
             colour=runtime.empty((height, width, 3)),
