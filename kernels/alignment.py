@@ -15,7 +15,7 @@ branches, pixels that take no part have weight 0.
 
 import taichi as ti
 
-from tgslam.kernels.simd import LANES, Lanes, lane_max, lanes_kernel, sums_of_16
+from tgslam.kernels.simd import LANES, Lanes, lane_max, lanes_kernel, larger, smaller, sums_of_16
 
 UNKNOWNS = 6  # rotation 3, translation 3
 TRIANGLE = UNKNOWNS * (UNKNOWNS + 1) // 2
@@ -101,7 +101,7 @@ def indicator(a, b):
 @ti.func
 def magnitude(x):
     """|x|."""
-    return ti.max(x, 0.0 - x)
+    return larger(x, 0.0 - x)
 
 
 @ti.func
@@ -171,7 +171,8 @@ def add_products(sums: ti.template(), row, x, y, z, b00, b01, b02, b11, b12, b22
 @ti.func
 def gate_at(settings: ti.template(), strength):
     """T of Eq. 11 for a gradient of that length: 1 = no texture."""
-    return 1.0 - ti.min(ti.max((strength - settings[GATE_LOW]) * settings[GATE_INVERSE_RANGE], 0.0), 1.0)
+    share = (strength - settings[GATE_LOW]) * settings[GATE_INVERSE_RANGE]
+    return 1.0 - smaller(larger(share, filled(share, 0.0)), filled(share, 1.0))
 
 
 @ti.func
@@ -210,7 +211,7 @@ def add_residuals(
     sigma = settings[DEPTH_SIGMA] * depth * depth
     has_normal = indicator(filled(z, 0.5), nx * nx + ny * ny + nz * nz)
     length = ti.sqrt(ray_x * ray_x + ray_y * ray_y + 1.0)
-    cosine = ti.max((0.0 - (nx * ray_x + ny * ray_y + nz)) / length, _MIN_COSINE)
+    cosine = larger((0.0 - (nx * ray_x + ny * ray_y + nz)) / length, filled(length, _MIN_COSINE))
     model_x = model_depth * ((near_u - settings[CX]) * (1.0 / settings[FX]))
     model_y = model_depth * ((near_v - settings[CY]) * (1.0 / settings[FY]))
     distance = nx * (x - model_x) + ny * (y - model_y) + nz * (z - model_depth)
@@ -236,7 +237,7 @@ def add_residuals(
     w_gradient = matched * (1.0 - gate) * irls_weight(ex * ex + ey * ey)
     w_gradient *= settings[WEIGHT_GRADIENT] * inv_gradient
     # sums of w j j^T and w e j over both, j the derivative by the position in the model's image, then by the point
-    inv_z = 1.0 / ti.max(z, _NEAR_M)
+    inv_z = 1.0 / larger(z, filled(z, _NEAR_M))
     sx, sy = settings[FX] * inv_z, settings[FY] * inv_z
     p0 = sx * (w_colour * e_colour * gx + w_gradient * (ex * gxx + ey * gxy))
     p1 = sy * (w_colour * e_colour * gy + w_gradient * (ex * gxy + ey * gyy))
@@ -272,12 +273,14 @@ def in_model_image(settings: ti.template(), x, y, z, width, height):
 
     Returns u, v, px, and the indicator.
     """
-    inv_z = 1.0 / ti.max(z, _NEAR_M)
+    inv_z = 1.0 / larger(z, filled(z, _NEAR_M))
     u, v = settings[FX] * x * inv_z + settings[CX], settings[FY] * y * inv_z + settings[CY]
     seen = indicator(filled(z, _NEAR_M), z)
-    seen *= 1.0 - ti.max(indicator(u, filled(u, 1.0)), indicator(v, filled(v, 1.0)))
+    seen *= (1.0 - indicator(u, filled(u, 1.0))) * (1.0 - indicator(v, filled(v, 1.0)))
     seen *= indicator(u, filled(u, width - 2.0)) * indicator(v, filled(v, height - 2.0))
-    return ti.min(ti.max(u, 1.0), width - 2.0), ti.min(ti.max(v, 1.0), height - 2.0), seen
+    u = smaller(larger(u, filled(u, 1.0)), filled(u, width - 2.0))
+    v = smaller(larger(v, filled(v, 1.0)), filled(v, height - 2.0))
+    return u, v, seen
 
 
 @ti.func
@@ -318,7 +321,7 @@ def add_16_pixels(
         t = bilinear(texture, u_cell, v_cell, um[j] - ti.cast(u_cell, ti.f32), vm[j] - ti.cast(v_cell, ti.f32))
         grey[j], gx[j], gy[j], gxx[j], gxy[j], gyy[j] = t[GREY], t[GX], t[GY], t[GXX], t[GXY], t[GYY]
     add_residuals(
-        settings, ray_x, ray_y, ti.max(depth, MIN_DEPTH_M),
+        settings, ray_x, ray_y, larger(depth, filled(depth, MIN_DEPTH_M)),
         live[v, block, LIVE_GREY], live[v, block, LIVE_GX], live[v, block, LIVE_GY], live[v, block, LIVE_STRENGTH],
         x, y, z, seen, nx, ny, nz, model_depth, near_u, near_v,
         grey, gx, gy, gxx, gxy, gyy, sums, row,

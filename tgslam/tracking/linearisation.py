@@ -117,11 +117,11 @@ class Lineariser:
 
     def _unpacked(self, sums: NDArray[np.float64]) -> NormalEquations:
         A = np.zeros((alignment.UNKNOWNS, alignment.UNKNOWNS))
-        A[_UPPER] = sums[: alignment.TRIANGLE]
+        A[_UPPER] = A.T[_UPPER] = sums[: alignment.TRIANGLE]
         named = sums.tolist()
         matched = max(named[alignment.MATCHED], 1.0)
         return NormalEquations(
-            A=A + np.triu(A, 1).T,
+            A=A,
             b=sums[alignment.RHS : alignment.RHS + alignment.UNKNOWNS],
             live_pixels=named[alignment.LIVE_PIXELS],
             candidates=named[alignment.CANDIDATES],
