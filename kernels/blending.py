@@ -6,7 +6,7 @@ A splat's row is read into scalars; dx, dy are the pixel's offset from its centr
 
 import taichi as ti
 
-from tgslam.kernels.simd import exp_neg
+from tgslam.kernels.simd import at_least, exp_neg, larger, smaller
 
 
 @ti.func
@@ -24,3 +24,17 @@ def tangent_depth(step, z, inv_z):
     camera.
     """
     return z + step * (1.0 + step * inv_z)
+
+
+@ti.func
+def least_exponent(xa, ya, xb, yb, a, b, c):
+    """Least a x^2 + b x y + c y^2 over the rectangle [xa, xb] x [ya, yb]; the form is positive.
+
+    It is taken where one of the two lines of the rectangle nearest to the origin comes nearest to it in that metric.
+    """
+    x, y = smaller(at_least(xa, 0.0), xb), smaller(at_least(ya, 0.0), yb)
+    y_at_x = smaller(larger((-0.5 * b / c) * x, ya), yb)
+    x_at_y = smaller(larger((-0.5 * b / a) * y, xa), xb)
+    on_column = (a * x + b * y_at_x) * x + c * y_at_x * y_at_x
+    on_row = (a * x_at_y + b * y) * x_at_y + c * y * y
+    return smaller(on_column, on_row)

@@ -10,7 +10,7 @@ has one writer, so results repeat bit for bit.
 
 import taichi as ti
 
-from tgslam.kernels.blending import raw_alpha, tangent_depth
+from tgslam.kernels.blending import least_exponent, raw_alpha, tangent_depth
 from tgslam.kernels.projection import EMBEDDING, FADE, INV_Z, QA, QB, QC, RED, ZU, ZV, U, V, Z
 from tgslam.kernels.simd import (
     ALPHA_MAX,
@@ -30,8 +30,6 @@ from tgslam.kernels.simd import (
     lane_max,
     lane_sum,
     lanes_kernel,
-    larger,
-    smaller,
     sums_of_4,
     sums_of_16,
 )
@@ -132,17 +130,11 @@ def pack_tile(
         for k in range(first, ti.min(first + GROUP, start[tile + 1])):
             row = splat[ids[k]]
             u, v = row[U] - x0, row[V] - y0
-            a, b, c = row[QA], row[QB], row[QC]
             row[U], row[V] = u, v
             rows[k] = row
-            reach = (REACH - row[FADE]) * 1.0001 + 1e-5
-            slope_y, slope_x = -0.5 * b / c, -0.5 * b / a
-            xa, ya = chunk_x - u, chunk_y - v
-            xb, yb = xa + (CHUNK - 1.0), ya + (CHUNK - 1.0)
-            # the chunk's lines nearest to the centre, and the least exponent on each
-            xn, yn = smaller(larger(xa, Lanes(0.0)), xb), smaller(larger(ya, Lanes(0.0)), yb)
-            y1, x1 = smaller(larger(slope_y * xn, ya), yb), smaller(larger(slope_x * yn, xa), xb)
-            q = smaller((a * xn + b * y1) * xn + c * y1 * y1, (a * x1 + b * yn) * x1 + c * yn * yn)
+            reach = (REACH - row[FADE]) * 1.0001 + 1e-5  # rounding may not lose a pixel
+            x, y = chunk_x - u, chunk_y - v
+            q = least_exponent(x, y, x + (CHUNK - 1.0), y + (CHUNK - 1.0), row[QA], row[QB], row[QC])
             reached = q <= Lanes(reach)
             mask[k] = ti.cast(lane_sum(ti.select(reached, powers, Lanes(0.0))), ti.i32)
             hits += ti.select(reached, Lanes(power), Lanes(0.0))

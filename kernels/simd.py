@@ -75,6 +75,15 @@ def at_most(x, bound: ti.template()):
 
 
 @ti.func
+def at_least(x, bound: ti.template()):
+    """`larger` of x and a constant."""
+    if ti.static(_is_vector(x)):
+        return larger(x, Lanes(bound))
+    else:
+        return larger(x, bound)
+
+
+@ti.func
 def exp_neg(q):
     """exp(-q) for 0 <= q <= REACH, less than ALPHA_MIN beyond; relative error 2.1e-6. For scalars and Lanes alike.
 

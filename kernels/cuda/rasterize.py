@@ -8,7 +8,7 @@ through the bits of its ballot over those that reach it: splats elsewhere in the
 
 import taichi as ti
 
-from tgslam.kernels.blending import raw_alpha, tangent_depth
+from tgslam.kernels.blending import least_exponent, raw_alpha, tangent_depth
 from tgslam.kernels.cuda.block import BLOCK, WARPS
 from tgslam.kernels.cuda.warp import ALL, WARP, sums_of_4, sums_of_16
 from tgslam.kernels.projection import EMBEDDING, FADE, INV_Z, M_EMBEDDING, QA, QB, QC, RED, SPLAT, ZU, ZV, U, V, Z
@@ -89,20 +89,6 @@ def find_starts(
             here = tile[slot]
         for t in range(before + 1, here + 1):
             start[t] = slot
-
-
-@ti.func
-def least_exponent(xa, ya, xb, yb, a, b, c):
-    """Least a x^2 + b x y + c y^2 over the rectangle [xa, xb] x [ya, yb]; the form is positive.
-
-    It is taken where one of the two lines of the rectangle nearest to the origin comes nearest to it in that metric.
-    """
-    x, y = ti.min(ti.max(xa, 0.0), xb), ti.min(ti.max(ya, 0.0), yb)
-    y_at_x = ti.min(ti.max((-0.5 * b / c) * x, ya), yb)
-    x_at_y = ti.min(ti.max((-0.5 * b / a) * y, xa), xb)
-    on_column = (a * x + b * y_at_x) * x + c * y_at_x * y_at_x
-    on_row = (a * x_at_y + b * y) * x_at_y + c * y * y
-    return ti.min(on_column, on_row)
 
 
 @ti.func
