@@ -84,8 +84,13 @@ def overlap(labels: NDArray[np.int32], segments: int, shown: list[NDArray[np.int
 
 
 def matching_cost(agreement: Agreement, iou: Vector, config: PlanesConfig) -> Vector:
-    """Eq. 7: c = w_theta theta / theta_max + w_d Delta d / delta_max + w_o (1 - IoU), the middle term at most w_d."""
-    offset = np.minimum(agreement.offset_ratio / config.max_offset_ratio, 1.0)
+    """Eq. 7: c = w_theta theta / theta_max + w_d Delta d / delta_max + w_o (1 - IoU).
+
+    The middle term is at most w_d, and at least w_d times the share of its gate that the deviation takes: surfaces
+    a few centimetres apart differ little in Delta d.
+    """
+    metric = agreement.deviation_sigmas / config.gate_sigmas
+    offset = np.minimum(np.maximum(agreement.offset_ratio / config.max_offset_ratio, metric), 1.0)
     return (
         config.weight_angle * agreement.angle_rad / config.max_angle_rad
         + config.weight_offset * offset

@@ -57,14 +57,16 @@ class PlaneEstimate:
         """With independent errors added to the angles and to the offset at the centroid."""
         return self._with_covariance(self.covariance + np.diag([sigma_rad**2, sigma_rad**2, sigma_m**2]))
 
-    def with_pose_error(self, sigma_rad: float, sigma_m: float) -> PlaneEstimate:
+    def with_pose_error(self, sigma_rad: float | Vector, sigma_m: float | Vector) -> PlaneEstimate:
         """Planes in a camera's frame, with the camera's own rotation and translation uncertain by so much per axis.
 
         A rotation w about the camera turns a plane by (t1 . w, t2 . w) and lifts its centroid r by w . (r x n).
+        Arrays of errors that broadcast with the planes give the covariance their shape; the other parts keep theirs.
         """
         lever = np.cross(self.centroid, self.normal)[..., None, :]
         turned = np.concatenate([self.axes, lever], axis=-2)  # [..., 3, 3] error per rotation of the camera
-        added = sigma_rad**2 * turned @ np.swapaxes(turned, -1, -2) + np.diag([0.0, 0.0, sigma_m**2])
+        added = np.multiply.outer(np.square(sigma_rad), np.ones((3, 3))) * (turned @ np.swapaxes(turned, -1, -2))
+        added = added + np.multiply.outer(np.square(sigma_m), np.diag([0.0, 0.0, 1.0]))
         return self._with_covariance(self.covariance + added)
 
     def _with_covariance(self, covariance: Vector) -> PlaneEstimate:

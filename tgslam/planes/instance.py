@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.config.schema import PlanesConfig
-from tgslam.geometry import inverse, transform_points
+from tgslam.geometry import transform_points
 from tgslam.planes import palette
 from tgslam.planes.estimate import PlaneEstimate, concatenated, fuse
 from tgslam.planes.support import Support
@@ -30,10 +30,12 @@ class PlanarInstance:
         """A candidate without views; `plane` is in the world."""
         self.id = NO_ID  # given once it counts
         self.plane = plane  # of all views, world
-        self.latest = plane  # of the latest view, world
+        self.latest = plane  # of the latest view, world, without the uncertainty of that view's pose
         self.support = Support(plane, config.cell_m)
         self.keyframes: list[int] = []  # all that saw it, ascending
-        self.missed = 0  # keyframes since it was last seen, while it is no more than a candidate
+        self.merged_into: PlanarInstance | None = None
+        self.split_from: PlanarInstance | None = None
+        self.unseen = 0  # keyframes since it was last seen
         self.through = 0  # keyframes, one after the other, that see through it
         self._config = config
         self._views: PlaneEstimate | None = None  # [N] each in its keyframe's camera
@@ -94,7 +96,7 @@ class PlanarInstance:
             np.array([rms_m]),
         )
         self.keyframes = sorted({*self.keyframes, keyframe})
-        self.missed = self.through = 0
+        self.unseen = self.through = 0
         self.refit(poses)
 
     def absorb(self, other: PlanarInstance, poses: Poses) -> None:
@@ -105,6 +107,7 @@ class PlanarInstance:
         cells, keyframes = other.support.cells()
         self.support.absorb(other.support.centres(cells), keyframes)
         self.refit(poses)
+        other.merged_into = self
 
     def refit(self, poses: Poses) -> None:
         """The plane that all views agree on, at the poses that their keyframes have now."""
@@ -113,7 +116,7 @@ class PlanarInstance:
         uncertain = self._views.with_pose_error(self._config.pose_sigma_rad, self._config.pose_sigma_m)
         world = uncertain.transformed(T_wc)
         self.plane = fuse(world, self._config.independent_views)
-        self.latest = world[-1]
+        self.latest = self._views[-1].transformed(T_wc[-1])
         self.support.follow(self.plane)
 
     def move(self, corrections: Poses, poses: Poses) -> None:
@@ -137,6 +140,7 @@ class PlanarInstance:
         if self._views is None or (minority := self._minority(poses)) is None:
             return None
         other = PlanarInstance(self.plane, self._config)
+        other.split_from = self
         other._take(self._views[minority], *self._rows(minority))
         own, rows = self._views[~minority], self._rows(~minority)
         self._views, (self._view_keyframes, self._view_areas, self._view_rms_m) = own, rows
@@ -183,11 +187,6 @@ class PlanarInstance:
         kept = _thinned(np.argsort(keyframes, kind="stable"), keyframes, self._config.observations)
         self._views = views[kept]
         self._view_keyframes, self._view_areas, self._view_rms_m = keyframes[kept], areas[kept], rms_m[kept]
-
-
-def world_views(local: PlaneEstimate, T_cw: Vector, config: PlanesConfig) -> PlaneEstimate:
-    """Planes of a camera's frame in the world, with the uncertainty of the camera's pose."""
-    return local.with_pose_error(config.pose_sigma_rad, config.pose_sigma_m).transformed(inverse(T_cw))
 
 
 def _thinned(order: NDArray[np.int64], keyframes: NDArray[np.int64], limit: int) -> NDArray[np.int64]:

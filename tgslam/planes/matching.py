@@ -10,14 +10,21 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tgslam.config.schema import PlanesConfig
+from tgslam.geometry import inverse
 from tgslam.planes.association import Agreement, assign, gate, matching_cost, overlap
 from tgslam.planes.estimate import PlaneEstimate, deviation_sigmas, from_segments, fuse, stacked
-from tgslam.planes.instance import PlanarInstance, world_views
-from tgslam.planes.sight import Samples, Sight, Tolerance, hidden_between, may_appear, sight
+from tgslam.planes.instance import PlanarInstance
+from tgslam.planes.sight import Samples, Sight, Tolerance, gap_between, may_appear, sight
 from tgslam.planes.support import Cells, Support
+
+Vector = NDArray[np.float64]
 
 _CONTACT_CELLS = 3  # in which two surfaces must adjoin
 _LEAST_SAMPLES = 4  # common to two masks
+WELL = 0.5  # of the gate: planes agree well
+_LENIENT_IOU = 0.5  # of masks that are matched without care
+_GAP_RATIO = 2.0  # the longest gap in sizes of the smaller surface
+_SHARED_VIEWS = 5  # latest ones in which two instances are compared
 _DEFERRED_VARIANCE = 4.0  # factor by which an ambiguous segment is less certain than it says
 
 
@@ -36,7 +43,6 @@ class ViewMatching:
         self.segments = samples.view.segments
         self.local = _with_model_error(from_segments(self.segments), self._areas_m2(), config.model_sigma_m)
         self.local.covariance[[not s.reliable for s in self.segments]] *= _DEFERRED_VARIANCE
-        self.world = world_views(self.local, samples.T_cw, config)
         self.owner: list[PlanarInstance | None] = [None] * len(self.segments)
         self.sights = self._sights()
 
@@ -47,39 +53,54 @@ class ViewMatching:
         self.owner[segment] = instance
         instance.support.add(self.samples.footprint(segment, instance.support), keyframe)
 
-    def overlapping(self) -> list[tuple[int, PlanarInstance]]:
-        """The one-to-one assignment: segments and the instances that their masks overlap, by Eqs. 5 to 7."""
-        if not self.segments or not self.sights:
+    def overlapping(self, careful: bool) -> list[tuple[int, PlanarInstance]]:
+        """The one-to-one assignment of what is not settled yet, segments to instances whose masks overlap: Eqs. 5 to 7.
+
+        Carefully first. What is left over then is matched leniently, for a pose that has jumped farther than expected,
+        but only where each covers most of the other.
+        """
+        free = [i for i, owner in enumerate(self.owner) if owner is None]
+        seen = [i for i in self.sights if not self.pieces(self.instances[i])]
+        if not free or not seen:
             return []
-        seen = [self.instances[i] for i in self.sights]
-        agreement = self._agreement(self.world, seen)
-        masks = overlap(self.samples.label, len(self.segments), [s.shown for s in self.sights.values()])
-        allowed = agreement.admitted & (masks.containment >= self.config.min_overlap)
-        allowed &= masks.intersection >= _LEAST_SAMPLES
-        pairs = assign(matching_cost(agreement, masks.iou, self.config), allowed)
-        return [(segment, seen[column]) for segment, column in pairs]
+        masks = overlap(self.samples.label, len(self.segments), [self.sights[i].shown for i in seen])
+        instances = [self.instances[i] for i in seen]
+        agreement = self._agreement(self.local[free], instances, careful)
+        allowed = agreement.admitted & (masks.intersection[free] >= _LEAST_SAMPLES)
+        if careful:
+            allowed &= masks.containment[free] >= self.config.min_overlap
+        else:
+            allowed &= masks.iou[free] >= _LENIENT_IOU
+        pairs = assign(matching_cost(agreement, masks.iou[free], self.config), allowed)
+        return [(free[row], instances[column]) for row, column in pairs]
 
     def continued(self, segment: int) -> PlanarInstance | None:
-        """The best-fitting instance whose surface an unmatched segment continues: overlaps, adjoins, or goes on behind
-        what hides the gap. An instance with other segments in this very view has to be coplanar with those, which the
-        camera's pose has no part in.
+        """The best-fitting instance whose surface an unmatched segment continues: adjoins without a gap, or beyond one
+        that is nowhere seen through. An instance with other segments in this very view has to be coplanar with those,
+        which the camera's pose has no part in; any other one has to agree well, since no overlap speaks for it.
         """
         if not self.instances:
             return None
-        agreement = self._agreement(self.world[segment : segment + 1], self.instances)
-        for i in np.argsort(agreement.deviation_sigmas[0], kind="stable"):
+        local = self.local[segment : segment + 1]
+        lenient = self._agreement(local, self.instances, careful=False)
+        careful = self._agreement(local, self.instances, careful=True)
+        agrees_well = careful.deviation_sigmas[0] <= WELL * self.config.gate_sigmas
+        for i in np.argsort(careful.deviation_sigmas[0], kind="stable"):
             instance = self.instances[int(i)]
-            if not agreement.admitted[0, i]:
-                continue
             pieces = self.pieces(instance)
-            if pieces and not self._coplanar(segment, pieces):
+            coplanar = self._coplanar(segment, pieces) if pieces else agrees_well[i] and careful.admitted[0, i]
+            if not (lenient.admitted[0, i] and coplanar):
                 continue
             footprint = self.samples.footprint(segment, instance.support)
             if adjoins(instance.support, footprint, self.config.max_gap_m) or (
-                pieces and self._bridged(footprint, instance)
+                agrees_well[i] and self._hidden_gap(footprint, instance)
             ):
                 return instance
         return None
+
+    def world(self, segment: int) -> PlaneEstimate:
+        """A segment's plane in the world."""
+        return self.local[segment].transformed(inverse(self.samples.T_cw))
 
     def pieces(self, instance: PlanarInstance) -> list[int]:
         """The segments that show an instance."""
@@ -106,32 +127,37 @@ class ViewMatching:
             for i in np.flatnonzero(near)
         }
 
-    def _agreement(self, planes: PlaneEstimate, instances: Sequence[PlanarInstance]) -> Agreement:
-        """Of planes [S] with instances [G]: with what all their views say, or with the latest view.
+    def _agreement(self, local: PlaneEstimate, instances: Sequence[PlanarInstance], careful: bool) -> Agreement:
+        """Of planes [S] in the camera's frame with instances [G].
 
-        Drift sets old views off against the present pose, but hardly the latest one.
+        Carefully: with the latest view or with all of them, the pose being uncertain by what it may have drifted since
+        the latest, which tells surfaces a few centimetres apart. Leniently: with all views, at the full uncertainty.
         """
-        position = self.samples.position_w
-        rows = planes[:, None]
-        all_views, latest = stacked([i.plane for i in instances]), stacked([i.latest for i in instances])
-        return gate(rows, all_views[None], position, self.config).or_better(
-            gate(rows, latest[None], position, self.config)
+        config = self.config
+        drift = np.sqrt(1.0 + np.array([i.unseen for i in instances]))[None] if careful else np.inf
+        step_rad, step_m = np.maximum(config.step_sigma_rad, 1e-9), np.maximum(config.step_sigma_m, 1e-9)
+        local = local[:, None].with_pose_error(
+            np.minimum(drift * step_rad, config.pose_sigma_rad), np.minimum(drift * step_m, config.pose_sigma_m)
         )
+        world, position = local.transformed(inverse(self.samples.T_cw)), self.samples.position_w
+        agreement = gate(world, stacked([i.plane for i in instances])[None], position, config)
+        if careful:
+            latest = stacked([i.latest for i in instances])[None]
+            agreement = agreement.or_better(gate(world, latest, position, config))
+        return agreement
 
     def _coplanar(self, segment: int, pieces: list[int]) -> bool:
         own, others = self.local[segment : segment + 1], self.local[pieces]
         sigmas = np.maximum(deviation_sigmas(own, others), deviation_sigmas(others, own))
         return bool(np.all(sigmas <= self.config.gate_sigmas))
 
-    def _bridged(self, footprint: Cells, instance: PlanarInstance) -> bool:
-        """Whether the gap between a footprint and an instance is short and hidden all the way."""
-        cells, _ = instance.support.cells()
-        distance, nearest = cKDTree(cells).query(footprint)
-        closest = int(np.argmin(distance))
-        if distance[closest] * instance.support.cell_m > self.config.bridge_m:
+    def _hidden_gap(self, footprint: Cells, instance: PlanarInstance) -> bool:
+        """Whether the gap between a footprint and an instance is short, and all of it is hidden in the image."""
+        gap = shortest_gap(instance.support, footprint, self.config.bridge_m)
+        if gap is None:
             return False
-        start, end = instance.support.centres(np.stack([footprint[closest], cells[nearest[closest]]]))
-        return hidden_between(self.samples, start, end, instance.plane, self.tolerance)
+        seen_through, in_image = gap_between(self.samples, *gap, instance.plane, self.tolerance)
+        return in_image and not seen_through
 
 
 def adjoins(support: Support, cells: Cells, gap_m: float) -> bool:
@@ -139,18 +165,34 @@ def adjoins(support: Support, cells: Cells, gap_m: float) -> bool:
     return int(support.near(cells, gap_m).sum()) >= min(_CONTACT_CELLS, len(cells)) > 0
 
 
-def same_surface(a: PlanarInstance, b: PlanarInstance, config: PlanesConfig) -> bool:
-    """Whether two instances that agree in the world are one: coplanar in the views that show both, and adjoining."""
+def shortest_gap(support: Support, cells: Cells, longest_m: float) -> tuple[Vector, Vector] | None:
+    """The nearest two places [3] m of cells [N, 2] and of the extent on whose grid they are.
+
+    None where they are farther apart than longest_m, or than twice the size of the smaller of the two.
+    """
+    occupied, _ = support.cells()
+    if len(occupied) == 0 or len(cells) == 0:
+        return None
+    distance, nearest = cKDTree(occupied).query(cells)
+    closest = int(np.argmin(distance))
+    limit = min(longest_m / support.cell_m, _GAP_RATIO * np.sqrt(min(len(occupied), len(cells))))
+    if distance[closest] > limit:
+        return None
+    start, end = support.centres(np.stack([cells[closest], occupied[nearest[closest]]]))
+    return start, end
+
+
+def coplanar_in_views(a: PlanarInstance, b: PlanarInstance) -> float | None:
+    """By how many sigmas two instances deviate in the latest views that show both (median); None without such views.
+
+    The poses of the views have no part in it.
+    """
     shared = [k for k in a.keyframes if k in b.keyframes]
-    pairs = [(first, second) for k in shared[-5:] if (first := a.view(k)) and (second := b.view(k))]
-    if pairs:
-        ours, theirs = (stacked(side) for side in zip(*pairs, strict=True))
-        apart = np.maximum(deviation_sigmas(ours, theirs), deviation_sigmas(theirs, ours))
-        if np.median(apart) > config.gate_sigmas:
-            return False
-    small, large = sorted((a, b), key=lambda instance: len(instance.support))
-    cells = large.support.cells_of(small.support.centres(small.support.cells()[0]))
-    return adjoins(large.support, np.unique(cells, axis=0), config.max_gap_m)
+    pairs = [(first, second) for k in shared[-_SHARED_VIEWS:] if (first := a.view(k)) and (second := b.view(k))]
+    if not pairs:
+        return None
+    ours, theirs = (stacked(side) for side in zip(*pairs, strict=True))
+    return float(np.median(np.maximum(deviation_sigmas(ours, theirs), deviation_sigmas(theirs, ours))))
 
 
 def _with_model_error(planes: PlaneEstimate, areas_m2: NDArray[np.float64], sigma_m: float) -> PlaneEstimate:

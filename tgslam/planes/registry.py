@@ -12,9 +12,9 @@ from tgslam.geometry import inverse
 from tgslam.planes.association import gate
 from tgslam.planes.estimate import PlaneEstimate, stacked
 from tgslam.planes.instance import NO_ID, PlanarInstance, Poses
-from tgslam.planes.matching import ViewMatching, same_surface
+from tgslam.planes.matching import WELL, ViewMatching, adjoins, coplanar_in_views, shortest_gap
 from tgslam.planes.segment import PlaneView
-from tgslam.planes.sight import Samples, Sight, Tolerance
+from tgslam.planes.sight import Samples, Sight, Tolerance, gap_between
 from tgslam.types import Camera, FloatImage
 
 _LEAST_SAMPLES = 12  # of a plane's extent in view, for the view to say something against it
@@ -50,6 +50,7 @@ class PlaneRegistry:
         self._instances: list[PlanarInstance] = []  # candidates included, oldest first
         self._poses: dict[int, NDArray[np.float64]] = {}  # keyframe -> T_wc [4, 4]
         self._absorbed_by: dict[int, int] = {}
+        self._apart: set[frozenset[PlanarInstance]] = set()  # coplanar pairs between which a view looks through
         self._next_id = 0
 
     @property
@@ -88,7 +89,7 @@ class PlaneRegistry:
         created = self._confirm(seen, matching)
         removed = self._weigh_contradictions(matching, seen)
         created += self._split(seen)
-        merged = self._merge(seen)
+        merged = self._merge(seen, samples)
         ids = [self._id_of(owner, keyframe) for owner in matching.owner]
         return Observation(keyframe, np.array(ids, np.int32), tuple(created), tuple(merged), tuple(removed))
 
@@ -103,16 +104,17 @@ class PlaneRegistry:
         affected = [i for i in self._instances if any(k in corrections for k in i.keyframes)]
         for instance in affected:
             instance.move(corrections, self._poses)
-        return tuple(self._merge(affected))
+        return tuple(self._merge(affected, None))
 
     def _match(self, matching: ViewMatching, keyframe: int) -> None:
         """Give every segment its instance; new ones for those that neither overlap nor continue one that there is."""
-        for segment, instance in matching.overlapping():
-            matching.give(segment, instance, keyframe)
+        for careful in (True, False):
+            for segment, instance in matching.overlapping(careful):
+                matching.give(segment, instance, keyframe)
         for segment in range(len(matching.segments)):
             if matching.owner[segment] is None:
                 found = matching.continued(segment)
-                matching.give(segment, found or PlanarInstance(matching.world[segment], self._config), keyframe)
+                matching.give(segment, found or PlanarInstance(matching.world(segment), self._config), keyframe)
 
     def _integrate(self, matching: ViewMatching, keyframe: int) -> list[PlanarInstance]:
         """Hand each instance its view; returns the instances in view, oldest first."""
@@ -123,17 +125,16 @@ class PlaneRegistry:
         return seen
 
     def _confirm(self, seen: list[PlanarInstance], matching: ViewMatching) -> list[int]:
-        """Candidates that have become PGIs. The others that were not seen come nearer to their end."""
+        """Candidates that have become PGIs. Those that have not for too long are dropped."""
         created = []
         for instance in seen:
             reliable = any(matching.segments[piece].reliable for piece in matching.pieces(instance))
             if instance.id == NO_ID and (reliable or len(instance.keyframes) >= self._config.confirm_views):
                 created.append(self._name(instance))
         for instance in self._instances:
-            if instance.id == NO_ID and instance not in seen:
-                instance.missed += 1
-                if instance.missed > self._config.candidate_keyframes:
-                    self._instances = [i for i in self._instances if i is not instance]
+            instance.unseen += instance not in seen
+        limit = self._config.candidate_keyframes
+        self._instances = [i for i in self._instances if i.id != NO_ID or i.unseen <= limit]
         return created
 
     def _weigh_contradictions(self, matching: ViewMatching, seen: list[PlanarInstance]) -> list[int]:
@@ -167,33 +168,63 @@ class PlaneRegistry:
         self._instances += parts
         return [self._name(part) for part in parts]
 
-    def _merge(self, touched: list[PlanarInstance]) -> list[tuple[int, int]]:
+    def _merge(self, touched: list[PlanarInstance], samples: Samples | None) -> list[tuple[int, int]]:
         """Make one of each pair of instances that turn out to be the same surface; (kept, absorbed) of PGIs."""
         merged = []
         for instance in touched:
-            while instance in self._instances and (other := self._twin(instance)) is not None:
+            while instance in self._instances and (other := self._twin(instance, samples)) is not None:
                 # A PGI before a candidate, then the older one
                 kept, absorbed = sorted((instance, other), key=lambda i: (i.id == NO_ID, i.id, i.keyframes[0]))
                 kept.absorb(absorbed, self._poses)
                 self._instances = [i for i in self._instances if i is not absorbed]
+                self._apart = {frozenset(kept if i is absorbed else i for i in pair) for pair in self._apart}
                 if absorbed.id != NO_ID:
                     self._absorbed_by[absorbed.id] = kept.id
                     merged.append((kept.id, absorbed.id))
                 instance = kept
         return merged
 
-    def _twin(self, instance: PlanarInstance) -> PlanarInstance | None:
-        """Another instance that is the same surface, judged from either one's centroid."""
+    def _twin(self, instance: PlanarInstance, samples: Samples | None) -> PlanarInstance | None:
+        """Another instance that is the same surface."""
         others = [i for i in self._instances if i is not instance]
         if not others:
             return None
         config = self._config
         planes = stacked([i.plane for i in others]).widened(config.pose_sigma_rad, config.pose_sigma_m)
         position = instance.centroid_w
-        admitted = gate(planes, instance.plane, position, config).admitted
-        admitted &= gate(instance.plane, planes, position, config).admitted
-        twins = (others[i] for i in np.flatnonzero(admitted) if same_surface(instance, others[i], config))
-        return next(twins, None)
+        forth, back = gate(planes, instance.plane, position, config), gate(instance.plane, planes, position, config)
+        sigmas = np.maximum(forth.deviation_sigmas, back.deviation_sigmas)
+        for i in np.flatnonzero(forth.admitted & back.admitted):
+            if self._coplanar(instance, others[i], float(sigmas[i])) and self._joined(instance, others[i], samples):
+                return others[i]
+        return None
+
+    def _coplanar(self, a: PlanarInstance, b: PlanarInstance, sigmas: float) -> bool:
+        """In the views that show both or, without any, agreeing well in the world, where they deviate by `sigmas`."""
+        in_views = coplanar_in_views(a, b)
+        if in_views is None:
+            return sigmas <= WELL * self._config.gate_sigmas
+        return in_views <= self._config.gate_sigmas
+
+    def _joined(self, a: PlanarInstance, b: PlanarInstance, samples: Samples | None) -> bool:
+        """Whether two coplanar instances adjoin, or are large surfaces with a gap that no view has looked through.
+
+        Floors, walls and ceilings go on behind things and where no view has looked; table tops are smaller.
+        """
+        small, large = sorted((a, b), key=lambda instance: len(instance.support))
+        cells = np.unique(large.support.cells_of(small.support.centres(small.support.cells()[0])), axis=0)
+        if adjoins(large.support, cells, self._config.max_gap_m):
+            return True
+        if samples is None or frozenset((a, b)) in self._apart:
+            return False
+        gap = shortest_gap(large.support, cells, self._config.bridge_m)
+        if gap is None:
+            return False
+        seen_through, _ = gap_between(samples, *gap, large.plane, self._tolerance)
+        if seen_through:
+            self._apart.add(frozenset((a, b)))
+            return False
+        return min(a.area_m2, b.area_m2) >= self._config.bridge_area_m2
 
     def _name(self, instance: PlanarInstance) -> int:
         instance.id = self._next_id
@@ -202,9 +233,9 @@ class PlaneRegistry:
 
     def _id_of(self, owner: PlanarInstance | None, keyframe: int) -> int:
         """The id of a segment's instance after this keyframe's merges and splits."""
-        if owner is None or owner.id == NO_ID:
+        while owner is not None and owner.merged_into is not None:
+            owner = owner.merged_into
+        if owner is None:
             return NO_ID
-        if keyframe in owner.keyframes:
-            return self.resolve(owner.id)
-        parts = [i.id for i in self._instances if keyframe in i.keyframes and i.id > owner.id]
-        return parts[-1] if parts else NO_ID
+        split_off = [i.id for i in self._instances if i.split_from is owner and keyframe in i.keyframes]
+        return split_off[-1] if split_off and keyframe not in owner.keyframes else owner.id

@@ -17,6 +17,7 @@ Vector = NDArray[np.float64]
 
 _NEAREST_M = 0.05  # places nearer to the camera's plane than this are not projected
 _GRAZING_COSINE = 0.05  # rays flatter than this say nothing of where they meet a plane
+_STEP_M = 0.02  # between the places at which a gap is looked at
 _MAX_FOOTPRINT_CELLS = 1 << 20  # a degenerate segment does not make the grid explode
 
 
@@ -141,20 +142,20 @@ def may_appear(samples: Samples, planes: PlaneEstimate, corners_w: Vector) -> ND
     return front
 
 
-def hidden_between(
+def gap_between(
     samples: Samples, start_w: Vector, end_w: Vector, plane: PlaneEstimate, tolerance: Tolerance
-) -> bool:
-    """Whether something in front of the plane hides the whole straight way between two places [3] m on it."""
-    steps = max(int(np.linalg.norm(end_w - start_w) / 0.02), 3)
+) -> tuple[bool, bool]:
+    """The straight way between two places [3] m of a plane: is it seen through anywhere, is it all in the image?
+
+    Where it is not seen through, the plane may go on behind something else.
+    """
+    steps = max(int(np.linalg.norm(end_w - start_w) / _STEP_M), 3)
     share = np.linspace(0.0, 1.0, steps + 2)[1:-1, None]
-    places = start_w + share * (end_w - start_w)
-    u, v, _, inside = samples.pixels(places)
-    if not inside.all():
-        return False
+    u, v, _, inside = samples.pixels(start_w + share * (end_w - start_w))
+    u, v = u[inside], v[inside]
     z = samples.depth_m[v, u].astype(np.float64)
     camera = samples.camera
     points = np.column_stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z])
     height = plane.heights_m(transform_points(inverse(samples.T_cw), points))
     limit = tolerance.sigmas * np.hypot(tolerance.sensor_per_m2 * z**2, tolerance.pose_m)
-    measured = z > 0
-    return bool(measured.any() and np.all(height[measured] > -limit[measured]))
+    return bool(np.any((z > 0) & (height < -limit))), bool(inside.all())

@@ -1,0 +1,165 @@
+"""Planes as a view would show them, from the truth of the built-in scenes, with the faults of a segmenter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from tgslam.config.schema import PlanesConfig, SyntheticConfig
+from tgslam.datasets.synthetic import SyntheticSource
+from tgslam.geometry import inverse, se3_exp
+from tgslam.planes.registry import Observation, PlaneRegistry
+from tgslam.planes.segment import PlaneSegment, PlaneView, tangents
+from tgslam.types import Camera
+
+DEPTH_SIGMA_PER_M2 = 0.0015
+LEAST_AREA_SHARE = 0.004  # of the image that a segment takes
+
+
+def points_c(camera: Camera, depth_m: np.ndarray) -> np.ndarray:
+    """[H, W, 3] m."""
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    return rays * depth_m[..., None].astype(np.float64)
+
+
+def segment_of(
+    points: np.ndarray, plane_c: np.ndarray, areas_m2: np.ndarray, rng: np.random.Generator, reliable: bool = True
+) -> PlaneSegment:
+    """The plane [4] with an error drawn from the covariance that a fit to the points [N, 3] would have."""
+    normal = plane_c[:3] * (1.0 if plane_c[3] > 0 else -1.0)
+    sigma = DEPTH_SIGMA_PER_M2 * points[:, 2] ** 2
+    weight = 1.0 / sigma**2
+    centroid = weight @ points / weight.sum()
+    first, second = tangents(normal)
+    u, v = (points - centroid) @ first, (points - centroid) @ second
+    design = np.column_stack([v, -u, np.ones(len(u))])
+    # Neighbouring pixels err together: as if a sixteenth of them were measured
+    covariance = np.linalg.inv(design.T @ (design * weight[:, None]) / 16.0)
+    alpha, beta, delta = np.linalg.cholesky(covariance) @ rng.standard_normal(3)
+    wrong = normal - alpha * second + beta * first
+    wrong /= np.linalg.norm(wrong)
+    centroid = centroid - (normal @ centroid + abs(plane_c[3])) * normal + delta * normal
+    return PlaneSegment(
+        normal_c=wrong,
+        offset_m=float(-wrong @ centroid),
+        centroid_c=centroid,
+        covariance=covariance,
+        area_px=len(points),
+        area_m2=float(areas_m2.sum()),
+        rms_sigmas=1.0,
+        rms_m=float(np.sqrt(np.mean(sigma**2))),
+        reliable=reliable,
+    )
+
+
+def view_from_labels(
+    camera: Camera,
+    depth_m: np.ndarray,
+    labels: np.ndarray,
+    planes_c: np.ndarray,
+    rng: np.random.Generator,
+    pieces: int = 1,
+) -> tuple[PlaneView, np.ndarray]:
+    """The largest ten planes of a view, and the true label of each segment.
+
+    labels [H, W] index planes_c [P, 4]; pieces: every plane is cut into so many by random lines, at most.
+    """
+    points = points_c(camera, depth_m)
+    cut = labels.copy()
+    for _ in range(pieces - 1):
+        angle, share = rng.uniform(0, np.pi), rng.uniform(0.3, 0.7)
+        along = np.cos(angle) * np.arange(camera.width) + np.sin(angle) * np.arange(camera.height)[:, None]
+        beyond = along > np.quantile(along, share)
+        cut = np.where((labels >= 0) & beyond, cut + len(planes_c), cut)
+    cut[depth_m <= 0] = -1
+    found, counts = np.unique(cut[cut >= 0], return_counts=True)
+    enough = counts >= LEAST_AREA_SHARE * labels.size
+    order = np.argsort(-counts[enough], kind="stable")[:10]
+    found = found[enough][order]
+    result, segments, truth = np.full(labels.shape, -1, np.int32), [], []
+    for label in found:
+        plane = planes_c[label % len(planes_c)]
+        mask = cut == label
+        own = points[mask]
+        cosine = np.abs(own @ plane[:3]) / np.linalg.norm(own, axis=1)
+        areas = own[:, 2] * np.linalg.norm(own, axis=1) / (camera.fx * camera.fy) / np.maximum(cosine, 0.05)
+        if np.median(cosine) < 0.1:
+            continue
+        result[mask] = len(segments)
+        segments.append(segment_of(own, plane, areas, rng))
+        truth.append(label % len(planes_c))
+    return PlaneView(result, tuple(segments)), np.array(truth, int)
+
+
+def with_label_noise(view: PlaneView, rng: np.random.Generator, shift_px: int = 2) -> PlaneView:
+    """Borders moved by up to so many pixels, and specks of no plane."""
+    height, width = view.labels.shape
+    dy, dx = rng.integers(-shift_px, shift_px + 1, size=(2, height, width))
+    rows = np.clip(np.arange(height)[:, None] + dy, 0, height - 1)
+    columns = np.clip(np.arange(width)[None] + dx, 0, width - 1)
+    labels = view.labels[rows, columns]
+    labels[rng.random(labels.shape) < 0.03] = -1
+    return replace(view, labels=labels)
+
+
+@dataclass
+class Playback:
+    """A built-in scene seen by a registry, with the true plane of every segment."""
+
+    scene: str
+    config: PlanesConfig = field(default_factory=PlanesConfig)
+    width: int = 200
+    height: int = 150
+    frames: int = 400
+    pieces: int = 1
+    pose_sigma: tuple[float, float] = (0.0, 0.0)  # rad, m
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        settings = SyntheticConfig(scene=self.scene, width=self.width, height=self.height, frames=self.frames)
+        self.source = SyntheticSource(settings, self.seed)
+        self.camera = self.source.camera
+        self.registry = PlaneRegistry(self.config, DEPTH_SIGMA_PER_M2)
+        self.rng = np.random.default_rng(self.seed)
+        self.sightings: list[tuple[int, int, int, float]] = []  # keyframe, true label, id, area m2
+        self.observations: list[Observation] = []
+
+    def T_cw(self, index: int) -> np.ndarray:
+        """The pose with its error."""
+        sigmas = np.repeat(self.pose_sigma, 3)
+        return se3_exp(self.rng.standard_normal(6) * sigmas) @ inverse(self.source.pose(index))
+
+    def view(self, index: int) -> tuple[PlaneView, np.ndarray, np.ndarray]:
+        """The frame's planes with noise, their true labels, and its depth image."""
+        depth_m = self.source.read(index).depth_m
+        T_cw = inverse(self.source.pose(index))
+        planes = self.source.planes()
+        normals = planes[:, :3] @ T_cw[:3, :3].T
+        planes_c = np.column_stack([normals, planes[:, 3] - normals @ T_cw[:3, 3]])
+        labels = self.source.labels(index)
+        view, truth = view_from_labels(self.camera, depth_m, labels, planes_c, self.rng, self.pieces)
+        return with_label_noise(view, self.rng), truth, depth_m
+
+    def play(self, indices: range) -> Playback:
+        """Show the registry these frames as keyframes."""
+        for index in indices:
+            view, truth, depth_m = self.view(index)
+            seen = self.registry.observe(view, depth_m, self.camera, self.T_cw(index), index)
+            self.observations.append(seen)
+            for segment, label in enumerate(truth):
+                row = (index, int(label), int(seen.ids[segment]), view.segments[segment].area_m2)
+                self.sightings.append(row)
+        return self
+
+    def ids_of_planes(self, least_area_m2: float = 0.2) -> dict[int, list[int]]:
+        """For each true plane seen with so much area at once: the ids it had, after merges, in order of time."""
+        largest: dict[int, float] = {}
+        for _, label, _, area in self.sightings:
+            largest[label] = max(largest.get(label, 0.0), area)
+        result: dict[int, list[int]] = {}
+        for _, label, plane_id, _ in self.sightings:
+            if largest[label] >= least_area_m2:
+                result.setdefault(label, []).append(self.registry.resolve(plane_id) if plane_id >= 0 else -1)
+        return result
