@@ -180,7 +180,7 @@ class PlanesConfig:
     mask_width_px: int = setting(128, 16, 4096)  # the masks of Eq. 6 are at most this wide
     max_gap_m: float = setting(0.1, 0.0, 10.0)  # surfaces this close to each other in their plane adjoin
     bridge_m: float = setting(3.0, 0.0, 100.0)  # likewise across a gap, unless a view looks through it
-    bridge_area_m2: float = setting(1.5, 0.0, 1000.0)  # of both, where part of the gap is outside the image
+    bridge_area_m2: float = setting(0.9, 0.0, 1000.0)  # of both, where part of the gap is outside the image
     pose_sigma_rad: float = setting(0.003, 0.0, 1.0)  # of a keyframe in the world
     pose_sigma_m: float = setting(0.01, 1e-4, 1.0)  # likewise
     step_sigma_rad: float = setting(0.001, 0.0, 1.0)  # of a keyframe relative to the one before

@@ -1,0 +1,113 @@
+"""Planes of a single depth image (section 3.2): cells -> graph -> agglomeration -> pixels -> fit -> judgement."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from tgslam import runtime
+from tgslam.config.schema import PlanesConfig
+from tgslam.plane_fit import CellGrid, Floats, PixelLabels, SegmentSums
+from tgslam.planes.bridging import Pieces, bridge
+from tgslam.planes.cells import CellGraph, planar_cells
+from tgslam.planes.merging import Agreement, Indices, agglomerate
+from tgslam.planes.moments import joining_cost, planes_of, squared_residuals
+from tgslam.planes.segment import PlaneSegment, PlaneView
+from tgslam.planes.statistics import Evidence, evidence, refined, width_px
+from tgslam.types import Camera
+
+_ROBUST_ROUNDS = 2
+_CHARBONNIER_SIGMAS = 1.5
+_RELIABLE_PART = 0.7  # of the limits beyond which there is no plane
+_PIECE_SHARE = 0.25  # of the least area, that pieces have before they are joined across gaps
+_MIN_CELLS = 2
+
+
+def extract_planes(depth_m: np.ndarray, camera: Camera, config: PlanesConfig, sigma_per_m2: float) -> PlaneView:
+    """Find the planes that a depth image shows, the largest first.
+
+    depth_m: device float32 [H, W], m, 0 = none. sigma_per_m2: sensor noise, sigma_z = this * z^2; in inverse depth,
+    in which planes are affine in the pixel, it is the same everywhere. Pixels of no plane are labelled -1. Segments
+    that other views have to confirm (small, thin, grazing, rough) come with reliable=False.
+    """
+    grid = CellGrid(camera, config.cell_px)
+    pieces = _pieces(depth_m, grid, config, sigma_per_m2)
+    if not len(pieces.moments):
+        return PlaneView(np.full((camera.height, camera.width), -1, np.int32), ())
+    pixels = PixelLabels(depth_m, grid, pieces.labels)
+    planes = planes_of(pieces.moments)
+    pixels.assign(planes, config.pixel_sigmas * _spread(pieces.moments, sigma_per_m2, config.max_rms_sigmas))
+    for _ in range(_ROBUST_ROUNDS):
+        before = planes
+        sums = pixels.sums(before, _CHARBONNIER_SIGMAS * sigma_per_m2)
+        planes = refined(before, sums)
+    found = _judged(planes, planes - before, sums, grid, config, sigma_per_m2)
+    number = np.full(len(planes) + 1, -1, np.int32)
+    number[[index for index, _ in found]] = np.arange(len(found))
+    return PlaneView(number[pixels.read()], tuple(segment for _, segment in found))
+
+
+def _pieces(depth_m: np.ndarray, grid: CellGrid, config: PlanesConfig, sigma: float) -> Pieces:
+    """Groups of cells that lie on one plane each; what is too small to become a segment is left out."""
+    graph = planar_cells(depth_m, grid, sigma, config.cell_share, config.cell_sigmas)
+    agreement = Agreement.seen_among(graph.moments, graph.edges, sigma, config.join_sigmas, config.join_shift_sigmas)
+    lenient = dataclasses.replace(agreement, shift_m=config.join_shift_m)
+    group, moments = agglomerate(graph.moments, _continuous(graph, agreement), lenient)
+    least_px = _PIECE_SHARE * config.min_area_share * grid.camera.width * grid.camera.height
+    kept = (moments[:, 0] >= least_px) & (np.bincount(group, minlength=len(moments)) >= _MIN_CELLS)
+    number = np.where(kept, np.cumsum(kept) - 1, -1)
+    labels = np.full(len(grid), -1, np.int32)
+    labels[graph.cell] = number[group]
+    pieces = Pieces(labels.reshape(grid.shape), moments[kept])
+    return bridge(pieces, runtime.to_host(depth_m), grid, agreement)
+
+
+def _continuous(graph: CellGraph, agreement: Agreement) -> Indices:
+    """[E, 2] those edges of the graph across which the surface has no step."""
+    first, second = graph.edges.T
+    cost = joining_cost(graph.moments, squared_residuals(graph.moments), first, second)
+    return graph.edges[agreement.admits(cost, graph.moments[first], graph.moments[second])]
+
+
+def _spread(moments: Floats, sigma: float, most_sigmas: float) -> Floats:
+    """[P] 1/m: standard deviation of the inverse depths about each plane, the sensor's at least."""
+    spread = np.sqrt(squared_residuals(moments) / np.maximum(moments[:, 0] - 3, 1.0))
+    return np.clip(spread, sigma, most_sigmas * sigma)
+
+
+def _judged(
+    planes: Floats, change: Floats, sums: SegmentSums, grid: CellGrid, config: PlanesConfig, sigma: float
+) -> list[tuple[int, PlaneSegment]]:
+    """Index and segment of the largest ones that are planes; change: [P, 3] since the sums were taken."""
+    image_px = grid.camera.width * grid.camera.height
+    found = []
+    for index in range(len(planes)):
+        rows = sums.of(index)
+        if rows.pixels.sum() < max(config.min_area_share * image_px, 6.0) or width_px(rows.moments.sum(axis=0)) < 1.0:
+            continue
+        seen = evidence(planes[index], change[index], rows, grid, sigma)
+        if seen.segment.rms_sigmas <= config.max_rms_sigmas and _bend(seen, config) <= 1.0:
+            reliable = _is_reliable(seen, image_px, config)
+            found.append((index, dataclasses.replace(seen.segment, reliable=reliable)))
+    found.sort(key=lambda item: (-item[1].area_px, item[0]))
+    return found[: config.max_segments]
+
+
+def _bend(seen: Evidence, config: PlanesConfig) -> float:
+    """By how much a surface is bent, over what is allowed: what the sensor may feign, or a real plane's unevenness."""
+    return min(seen.bend_sigmas / config.max_bend_sigmas, seen.bend_m / config.max_bend_m)
+
+
+def _is_reliable(seen: Evidence, image_px: int, config: PlanesConfig) -> bool:
+    """Whether a segment counts by itself: other views have to confirm small, thin, grazing, rough and bent ones."""
+    segment = seen.segment
+    turn = float(np.sqrt(np.linalg.eigvalsh(segment.covariance[:2, :2])[-1]))
+    return bool(
+        segment.area_px >= config.reliable_area_share * image_px
+        and turn <= config.reliable_angle_rad
+        and np.sqrt(segment.covariance[2, 2]) <= config.reliable_offset_m
+        and seen.cosine >= config.reliable_cosine
+        and _bend(seen, config) <= _RELIABLE_PART
+        and seen.width_px >= config.reliable_width_cells * config.cell_px
+    )

@@ -1,0 +1,105 @@
+"""Agglomeration: what belongs to one plane grows together, the pair that costs least first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tgslam.plane_fit import Floats
+from tgslam.planes.moments import joining_cost, squared_residuals
+
+Indices = NDArray[np.intp]
+
+_OVER_MEDIAN = 2.0  # three standard deviations: the median of chi-square of 3 degrees is 2.4, its 99 % quantile 11.3
+_ABSORBED = 8.0  # a set of so many times the points hardly changes by what it takes in
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """When one plane may serve two sets of points."""
+
+    sigma: float  # 1/m, standard deviation of inverse depth at a pixel
+    sigmas: float  # allowed for the noise of the two fits
+    shift_sigmas: float  # allowed beyond it, root mean square over the smaller set: sensors bend planes
+    shift_m: float = 0.0  # likewise, of depth: real surfaces are not quite planes
+
+    @classmethod
+    def seen_among(
+        cls, moments: Floats, edges: Indices, sigma: float, sigmas: float, most_shift_sigmas: float
+    ) -> Agreement:
+        """As much shift as the sensor itself shows, at most `most_shift_sigmas`.
+
+        Most neighbouring cells lie on one surface: how far apart their planes are in the median is the sensor's own
+        correlated error, be it white noise (0.2 sigma) or a real sensor's steps and waves (0.6 sigma).
+        """
+        if not len(edges):
+            return cls(sigma, sigmas, most_shift_sigmas)
+        first, second = edges.T
+        cost = joining_cost(moments, squared_residuals(moments), first, second)
+        median = float(np.median(cost / np.minimum(moments[first, 0], moments[second, 0])))
+        return cls(sigma, sigmas, min(_OVER_MEDIAN * np.sqrt(median) / sigma, most_shift_sigmas))
+
+    def admits(self, cost: Floats, first: Floats, second: Floats) -> NDArray[np.bool_]:
+        """Whether the `joining_cost` [E], 1/m^2, of pairs of sets with those moments [E, 10] is small enough [E]."""
+        fewer = np.minimum(first[:, 0], second[:, 0])
+        inverse_depth = (first[:, 6] + second[:, 6]) / np.maximum(first[:, 0] + second[:, 0], 1.0)
+        shift = (self.shift_sigmas * self.sigma) ** 2 + (self.shift_m * inverse_depth**2) ** 2
+        return cost <= (self.sigmas * self.sigma) ** 2 + shift * fewer
+
+
+def agglomerate(moments: Floats, edges: Indices, agreement: Agreement) -> tuple[Indices, Floats]:
+    """Join neighbouring sets of points while they agree, cheapest first; fit anew after every join.
+
+    Each round joins all the pairs that are each other's cheapest partner, which is what a queue of single joins arrives
+    at: joining never makes a third set cheaper than it was for both (Ward's criterion is reducible). A set also joins
+    its cheapest partner if that is very much larger, so that large planes do not take in their rims one by one.
+    moments: [N, 10] of the sets; edges: [E, 2]. Returns the group of each set [N], and the groups' moments [G, 10].
+    """
+    group = np.arange(len(moments))
+    while len(edges):
+        partner = _partners(moments, edges, agreement)
+        if (partner == np.arange(len(moments))).all():
+            break
+        alive, number = np.unique(_roots(partner), return_inverse=True)
+        joined = np.zeros((len(alive), moments.shape[1]))
+        np.add.at(joined, number, moments)
+        group, moments = number[group], joined
+        edges = _distinct(number[edges], len(alive))
+    return group, moments
+
+
+def _partners(moments: Floats, edges: Indices, agreement: Agreement) -> Indices:
+    """[N] the set that each one joins, or itself: no circles, for partners are larger, or earlier and stay."""
+    size = moments[:, 0]
+    first, second = edges.T
+    cost = joining_cost(moments, squared_residuals(moments), first, second)
+    allowed = agreement.admits(cost, moments[first], moments[second])
+    low, high, cost = first[allowed], second[allowed], cost[allowed]
+    least = np.full(len(moments), np.inf)  # cost of the cheapest edge at each set
+    np.minimum.at(least, low, cost)
+    np.minimum.at(least, high, cost)
+    partner = np.arange(len(moments))
+    for small, large in ((low, high), (high, low)):
+        absorbed = (cost == least[small]) & (size[large] >= _ABSORBED * size[small])
+        partner[small[absorbed]] = large[absorbed]
+    mutual = (cost == least[low]) & (cost == least[high])
+    partner[high[mutual]] = low[mutual]
+    partner[low[mutual]] = low[mutual]
+    return partner
+
+
+def _roots(partner: Indices) -> Indices:
+    """[N] where each chain of partners ends."""
+    while (partner[partner] != partner).any():
+        partner = partner[partner]
+    return partner
+
+
+def _distinct(edges: Indices, nodes: int) -> Indices:
+    """Each pair of different nodes once, the smaller first."""
+    low, high = np.minimum(*edges.T), np.maximum(*edges.T)
+    keys = np.sort((low * nodes + high)[low != high])
+    keys = keys[np.diff(keys, prepend=-1) > 0]
+    return np.stack(np.divmod(keys, max(nodes, 1)), axis=1)

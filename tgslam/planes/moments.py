@@ -1,0 +1,54 @@
+"""Least-squares planes from moments: many small fits at once, and what joining two sets of points costs.
+
+Moments [N, 10] and planes [N, 3] are those of `tgslam.plane_fit`: inverse depth affine in the pixel.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+_SINGULAR = 1e-6  # of the product of the variances: points on a line
+
+
+def squared_residuals(moments: Floats) -> Floats:
+    """[N] 1/m^2: sum of squared residuals of the best plane of each set; without a plane, as if it had no slope."""
+    return _fitted(moments)[0]
+
+
+def planes_of(moments: Floats) -> Floats:
+    """[N, 3] best planes g0, gx, gy; where the points lie on a line or are too few, a plane without slope."""
+    n, x, y, *_, w = moments.T[:7]
+    _, gx, gy = _fitted(moments)
+    return np.stack([(w - gx * x - gy * y) / np.maximum(n, 1e-12), gx, gy], axis=1)
+
+
+def information(moments: Floats) -> Floats:
+    """[3, 3] normal matrix over (g0, gx, gy) of one set's moments [10]."""
+    n, x, y, xx, xy, yy = moments[:6]
+    return np.array([[n, x, y], [x, xx, xy], [y, xy, yy]])
+
+
+def joining_cost(moments: Floats, squares: Floats, first: NDArray[np.intp], second: NDArray[np.intp]) -> Floats:
+    """[E] 1/m^2: by how much the squared residuals of sets `first` and `second` [E] grow if one plane serves both.
+
+    It is d^T (P_1 + P_2)^-1 d, d the difference of the two planes and P their covariances at unit noise. squares:
+    `squared_residuals` of the moments.
+    """
+    joint = squared_residuals(moments[first] + moments[second])
+    return np.maximum(joint - squares[first] - squares[second], 0.0)
+
+
+def _fitted(moments: Floats) -> tuple[Floats, Floats, Floats]:
+    """Squared residuals and slopes gx, gy; each [N]."""
+    n, x, y, xx, xy, yy, w, xw, yw, ww = np.ascontiguousarray(moments.T)
+    inverse = 1.0 / np.maximum(n, 1e-12)
+    mx, my, mw = x * inverse, y * inverse, w * inverse
+    xx, xy, yy = xx - mx * x, xy - mx * y, yy - my * y
+    xw, yw, ww = xw - mx * w, yw - my * w, ww - mw * w
+    det = xx * yy - xy * xy
+    scale = np.where(det > _SINGULAR * xx * yy, 1.0, 0.0) / np.where(det > 0, det, 1.0)
+    gx, gy = (yy * xw - xy * yw) * scale, (xx * yw - xy * xw) * scale
+    return np.maximum(ww - gx * xw - gy * yw, 0.0), gx, gy
