@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from tgslam.config.schema import PlanesConfig
 from tgslam.geometry import inverse
-from tgslam.planes.association import Agreement, assign, gate, matching_cost, overlap
+from tgslam.planes.association import Agreement, Overlap, assign, gate, matching_cost, overlap
 from tgslam.planes.estimate import PlaneEstimate, deviation_sigmas, from_segments, fuse, stacked
 from tgslam.planes.instance import PlanarInstance
 from tgslam.planes.sight import Samples, Sight, Tolerance, gap_between, may_appear, sight
@@ -22,7 +22,8 @@ Vector = NDArray[np.float64]
 _CONTACT_CELLS = 3  # in which two surfaces must adjoin
 _LEAST_SAMPLES = 4  # common to two masks
 WELL = 0.5  # of the gate: planes agree well
-_LENIENT_IOU = 0.5  # of masks that are matched without care
+_CAREFUL_IOU = 0.15  # of masks that are matched one to one; less is for pieces, which `continued` is for
+_LENIENT_IOU = 0.5  # likewise without care
 _GAP_RATIO = 2.0  # the longest gap in sizes of the smaller surface
 _SHARED_VIEWS = 5  # latest ones in which two instances are compared
 _DEFERRED_VARIANCE = 4.0  # factor by which an ambiguous segment is less certain than it says
@@ -63,40 +64,42 @@ class ViewMatching:
         seen = [i for i in self.sights if not self.pieces(self.instances[i])]
         if not free or not seen:
             return []
-        masks = overlap(self.samples.label, len(self.segments), [self.sights[i].shown for i in seen])
         instances = [self.instances[i] for i in seen]
+        masks = self._overlap(seen)
         agreement = self._agreement(self.local[free], instances, careful)
-        allowed = agreement.admitted & (masks.intersection[free] >= _LEAST_SAMPLES)
-        if careful:
-            allowed &= masks.containment[free] >= self.config.min_overlap
-        else:
-            allowed &= masks.iou[free] >= _LENIENT_IOU
+        allowed = agreement.admitted & self._meet(masks)[free]
+        allowed &= masks.iou[free] >= (_CAREFUL_IOU if careful else _LENIENT_IOU)
         pairs = assign(matching_cost(agreement, masks.iou[free], self.config), allowed)
         return [(free[row], instances[column]) for row, column in pairs]
 
     def continued(self, segment: int) -> PlanarInstance | None:
-        """The best-fitting instance whose surface an unmatched segment continues: adjoins without a gap, or beyond one
-        that is nowhere seen through. An instance with other segments in this very view has to be coplanar with those,
-        which the camera's pose has no part in; any other one has to agree well, since no overlap speaks for it.
+        """The instance whose surface an unmatched segment continues: overlaps, adjoins, or goes on behind what hides
+        the gap. Of several, the one that has most of it beside its extent and fits best.
+
+        An instance with other segments in this very view has to be coplanar with those, which the camera's pose has no
+        part in. Any other one has to overlap as for the one-to-one assignment, or to fit well.
         """
         if not self.instances:
             return None
         local = self.local[segment : segment + 1]
-        lenient = self._agreement(local, self.instances, careful=False)
+        admitted = self._agreement(local, self.instances, careful=False).admitted[0]
         careful = self._agreement(local, self.instances, careful=True)
-        agrees_well = careful.deviation_sigmas[0] <= WELL * self.config.gate_sigmas
-        for i in np.argsort(careful.deviation_sigmas[0], kind="stable"):
-            instance = self.instances[int(i)]
+        misfit = careful.deviation_sigmas[0] / self.config.gate_sigmas
+        best, best_score = None, -np.inf
+        for i in np.flatnonzero(admitted):
+            instance = self.instances[i]
             pieces = self.pieces(instance)
-            coplanar = self._coplanar(segment, pieces) if pieces else agrees_well[i] and careful.admitted[0, i]
-            if not (lenient.admitted[0, i] and coplanar):
+            fits_well = bool(misfit[i] <= WELL)
+            if not (self._coplanar(segment, pieces) if pieces else fits_well or self._overlaps(segment, int(i))):
                 continue
             footprint = self.samples.footprint(segment, instance.support)
-            if adjoins(instance.support, footprint, self.config.max_gap_m) or (
-                agrees_well[i] and self._hidden_gap(footprint, instance)
-            ):
-                return instance
-        return None
+            beside = instance.support.near(footprint, self.config.max_gap_m)
+            if not (adjoins(beside) or (fits_well and self._hidden_gap(footprint, instance))):
+                continue
+            score = float(np.mean(beside) - misfit[i])
+            if score > best_score:
+                best, best_score = instance, score
+        return best
 
     def world(self, segment: int) -> PlaneEstimate:
         """A segment's plane in the world."""
@@ -146,6 +149,17 @@ class ViewMatching:
             agreement = agreement.or_better(gate(world, latest, position, config))
         return agreement
 
+    def _overlap(self, seen: list[int]) -> Overlap:
+        """Of all segments with some of the instances in sight."""
+        return overlap(self.samples.label, len(self.segments), [self.sights[i].shown for i in seen])
+
+    def _meet(self, masks: Overlap) -> NDArray[np.bool_]:
+        """[S, G]: whether masks overlap enough."""
+        return (masks.containment >= self.config.min_overlap) & (masks.intersection >= _LEAST_SAMPLES)
+
+    def _overlaps(self, segment: int, index: int) -> bool:
+        return index in self.sights and bool(self._meet(self._overlap([index]))[segment, 0])
+
     def _coplanar(self, segment: int, pieces: list[int]) -> bool:
         own, others = self.local[segment : segment + 1], self.local[pieces]
         sigmas = np.maximum(deviation_sigmas(own, others), deviation_sigmas(others, own))
@@ -160,9 +174,9 @@ class ViewMatching:
         return in_image and not seen_through
 
 
-def adjoins(support: Support, cells: Cells, gap_m: float) -> bool:
-    """Whether cells [N, 2] of a surface's grid overlap its extent or border on it without a gap."""
-    return int(support.near(cells, gap_m).sum()) >= min(_CONTACT_CELLS, len(cells)) > 0
+def adjoins(beside: NDArray[np.bool_]) -> bool:
+    """Whether a surface adjoins another, given which of its cells [N] lie beside cells of that."""
+    return int(beside.sum()) >= min(_CONTACT_CELLS, len(beside)) > 0
 
 
 def shortest_gap(support: Support, cells: Cells, longest_m: float) -> tuple[Vector, Vector] | None:

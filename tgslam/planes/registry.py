@@ -18,6 +18,7 @@ from tgslam.planes.sight import Samples, Sight, Tolerance, gap_between
 from tgslam.types import Camera, FloatImage
 
 _LEAST_SAMPLES = 12  # of a plane's extent in view, for the view to say something against it
+_MOST = 0.5
 _SUSPECT_PLANES = 3  # so many contradicted at once, and more than confirmed: the pose is wrong, not the planes
 
 
@@ -200,20 +201,24 @@ class PlaneRegistry:
         return None
 
     def _coplanar(self, a: PlanarInstance, b: PlanarInstance, sigmas: float) -> bool:
-        """In the views that show both or, without any, agreeing well in the world, where they deviate by `sigmas`."""
+        """In the views that show both or, without any, in the world, where they deviate by `sigmas`: by half the gate
+        unless the extent of one lies for the most part in that of the other.
+        """
         in_views = coplanar_in_views(a, b)
-        if in_views is None:
-            return sigmas <= WELL * self._config.gate_sigmas
-        return in_views <= self._config.gate_sigmas
+        if in_views is not None:
+            return in_views <= self._config.gate_sigmas
+        if sigmas <= WELL * self._config.gate_sigmas:
+            return True
+        large, cells = _on_larger(a, b)
+        return sigmas <= self._config.gate_sigmas and float(np.mean(large.support.holds(cells))) > _MOST
 
     def _joined(self, a: PlanarInstance, b: PlanarInstance, samples: Samples | None) -> bool:
         """Whether two coplanar instances adjoin, or are large surfaces with a gap that no view has looked through.
 
         Floors, walls and ceilings go on behind things and where no view has looked; table tops are smaller.
         """
-        small, large = sorted((a, b), key=lambda instance: len(instance.support))
-        cells = np.unique(large.support.cells_of(small.support.centres(small.support.cells()[0])), axis=0)
-        if adjoins(large.support, cells, self._config.max_gap_m):
+        large, cells = _on_larger(a, b)
+        if adjoins(large.support.near(cells, self._config.max_gap_m)):
             return True
         if samples is None or frozenset((a, b)) in self._apart:
             return False
@@ -239,3 +244,9 @@ class PlaneRegistry:
             return NO_ID
         split_off = [i.id for i in self._instances if i.split_from is owner and keyframe in i.keyframes]
         return split_off[-1] if split_off and keyframe not in owner.keyframes else owner.id
+
+
+def _on_larger(a: PlanarInstance, b: PlanarInstance) -> tuple[PlanarInstance, NDArray[np.int64]]:
+    """The one of larger extent, and the cells [N, 2] of its grid over which the extent of the other lies."""
+    small, large = sorted((a, b), key=lambda instance: len(instance.support))
+    return large, np.unique(large.support.cells_of(small.support.centres(small.support.cells()[0])), axis=0)
