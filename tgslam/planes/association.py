@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,10 @@ class Agreement:
     offset_ratio: Vector  # Delta d of Eq. 5
     deviation_sigmas: Vector
     admitted: Mask  # passes the gate
+
+    def __getitem__(self, key: Any) -> Agreement:
+        """Some of the pairs."""
+        return Agreement(self.angle_rad[key], self.offset_ratio[key], self.deviation_sigmas[key], self.admitted[key])
 
     def or_better(self, other: Agreement) -> Agreement:
         """Pair by pair the one of the two that passes the gate, or deviates less."""

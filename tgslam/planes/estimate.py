@@ -95,7 +95,13 @@ def from_segments(segments: Sequence[PlaneSegment]) -> PlaneEstimate:
 
 def stacked(planes: Sequence[PlaneEstimate]) -> PlaneEstimate:
     """Single planes of one frame as an array [N]."""
-    return PlaneEstimate(*(np.stack(parts) for parts in zip(*(vars(p).values() for p in planes), strict=True)))
+    return PlaneEstimate(
+        np.array([p.normal for p in planes]).reshape(-1, 3),
+        np.array([p.offset_m for p in planes]).reshape(-1),
+        np.array([p.centroid for p in planes]).reshape(-1, 3),
+        np.array([p.axes for p in planes]).reshape(-1, 2, 3),
+        np.array([p.covariance for p in planes]).reshape(-1, 3, 3),
+    )
 
 
 def concatenated(first: PlaneEstimate, second: PlaneEstimate) -> PlaneEstimate:

@@ -85,7 +85,9 @@ class PlanarInstance:
     def view(self, keyframe: int) -> PlaneEstimate | None:
         """The plane as that keyframe saw it, in its camera's frame; None where it did not or is no longer known."""
         index = np.flatnonzero(self._view_keyframes == keyframe)
-        return fuse(self._views[index]) if self._views is not None and len(index) else None
+        if self._views is None or len(index) == 0:
+            return None
+        return self._views[int(index[0])] if len(index) == 1 else fuse(self._views[index])
 
     def add_view(self, keyframe: int, local: PlaneEstimate, area_m2: float, rms_m: float, poses: Poses) -> None:
         """A plane in a keyframe's camera frame is this one. Refits the plane."""

@@ -46,6 +46,8 @@ class ViewMatching:
         self.local.covariance[[not s.reliable for s in self.segments]] *= _DEFERRED_VARIANCE
         self.owner: list[PlanarInstance | None] = [None] * len(self.segments)
         self.sights = self._sights()
+        self._known = len(self.instances)  # those after are new in this view
+        self._careful, self._lenient = self._agreements()
 
     def give(self, segment: int, instance: PlanarInstance, keyframe: int) -> None:
         """The segment shows the instance, which may be a new one."""
@@ -66,7 +68,7 @@ class ViewMatching:
             return []
         instances = [self.instances[i] for i in seen]
         masks = self._overlap(seen)
-        agreement = self._agreement(self.local[free], instances, careful)
+        agreement = (self._careful if careful else self._lenient)[np.ix_(free, seen)]
         allowed = agreement.admitted & self._meet(masks)[free]
         allowed &= masks.iou[free] >= (_CAREFUL_IOU if careful else _LENIENT_IOU)
         pairs = assign(matching_cost(agreement, masks.iou[free], self.config), allowed)
@@ -79,12 +81,9 @@ class ViewMatching:
         An instance with other segments in this very view has to be coplanar with those, which the camera's pose has no
         part in. Any other one has to overlap as for the one-to-one assignment, or to fit well.
         """
-        if not self.instances:
-            return None
-        local = self.local[segment : segment + 1]
-        admitted = self._agreement(local, self.instances, careful=False).admitted[0]
-        careful = self._agreement(local, self.instances, careful=True)
-        misfit = careful.deviation_sigmas[0] / self.config.gate_sigmas
+        new = len(self.instances) - self._known  # these are in this view, which is what decides
+        admitted = np.append(self._lenient.admitted[segment], np.ones(new, bool))
+        misfit = np.append(self._careful.deviation_sigmas[segment] / self.config.gate_sigmas, np.zeros(new))
         best, best_score = None, -np.inf
         for i in np.flatnonzero(admitted):
             instance = self.instances[i]
@@ -130,24 +129,23 @@ class ViewMatching:
             for i in np.flatnonzero(near)
         }
 
-    def _agreement(self, local: PlaneEstimate, instances: Sequence[PlanarInstance], careful: bool) -> Agreement:
-        """Of planes [S] in the camera's frame with instances [G].
+    def _agreements(self) -> tuple[Agreement, Agreement]:
+        """Of the segments [S] with the instances [G], carefully and leniently.
 
         Carefully: with the latest view or with all of them, the pose being uncertain by what it may have drifted since
         the latest, which tells surfaces a few centimetres apart. Leniently: with all views, at the full uncertainty.
         """
-        config = self.config
-        drift = np.sqrt(1.0 + np.array([i.unseen for i in instances]))[None] if careful else np.inf
-        step_rad, step_m = np.maximum(config.step_sigma_rad, 1e-9), np.maximum(config.step_sigma_m, 1e-9)
-        local = local[:, None].with_pose_error(
-            np.minimum(drift * step_rad, config.pose_sigma_rad), np.minimum(drift * step_m, config.pose_sigma_m)
-        )
-        world, position = local.transformed(inverse(self.samples.T_cw)), self.samples.position_w
-        agreement = gate(world, stacked([i.plane for i in instances])[None], position, config)
-        if careful:
-            latest = stacked([i.latest for i in instances])[None]
-            agreement = agreement.or_better(gate(world, latest, position, config))
-        return agreement
+        config, position = self.config, self.samples.position_w
+        drift = np.sqrt(1.0 + np.array([i.unseen for i in self.instances], np.float64))[None]
+        local, T_wc = self.local[:, None], inverse(self.samples.T_cw)
+        all_views, latest = (stacked([getattr(i, name) for i in self.instances]) for name in ("plane", "latest"))
+        near = local.with_pose_error(
+            np.minimum(drift * config.step_sigma_rad, config.pose_sigma_rad),
+            np.minimum(drift * config.step_sigma_m, config.pose_sigma_m),
+        ).transformed(T_wc)
+        far = local.with_pose_error(config.pose_sigma_rad, config.pose_sigma_m).transformed(T_wc)
+        careful = gate(near, all_views[None], position, config).or_better(gate(near, latest[None], position, config))
+        return careful, gate(far, all_views[None], position, config)
 
     def _overlap(self, seen: list[int]) -> Overlap:
         """Of all segments with some of the instances in sight."""

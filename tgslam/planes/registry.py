@@ -172,32 +172,32 @@ class PlaneRegistry:
     def _merge(self, touched: list[PlanarInstance], samples: Samples | None) -> list[tuple[int, int]]:
         """Make one of each pair of instances that turn out to be the same surface; (kept, absorbed) of PGIs."""
         merged = []
-        for instance in touched:
-            while instance in self._instances and (other := self._twin(instance, samples)) is not None:
-                # A PGI before a candidate, then the older one
-                kept, absorbed = sorted((instance, other), key=lambda i: (i.id == NO_ID, i.id, i.keyframes[0]))
-                kept.absorb(absorbed, self._poses)
-                self._instances = [i for i in self._instances if i is not absorbed]
-                self._apart = {frozenset(kept if i is absorbed else i for i in pair) for pair in self._apart}
-                if absorbed.id != NO_ID:
-                    self._absorbed_by[absorbed.id] = kept.id
-                    merged.append((kept.id, absorbed.id))
-                instance = kept
+        while (twins := self._twins([i for i in touched if i in self._instances], samples)) is not None:
+            # A PGI before a candidate, then the older one
+            kept, absorbed = sorted(twins, key=lambda i: (i.id == NO_ID, i.id, i.keyframes[0]))
+            kept.absorb(absorbed, self._poses)
+            self._instances = [i for i in self._instances if i is not absorbed]
+            self._apart = {frozenset(kept if i is absorbed else i for i in pair) for pair in self._apart}
+            touched = [*touched, kept]
+            if absorbed.id != NO_ID:
+                self._absorbed_by[absorbed.id] = kept.id
+                merged.append((kept.id, absorbed.id))
         return merged
 
-    def _twin(self, instance: PlanarInstance, samples: Samples | None) -> PlanarInstance | None:
-        """Another instance that is the same surface."""
-        others = [i for i in self._instances if i is not instance]
-        if not others:
-            return None
+    def _twins(
+        self, touched: list[PlanarInstance], samples: Samples | None
+    ) -> tuple[PlanarInstance, PlanarInstance] | None:
+        """An instance out of `touched`, and another one, that are the same surface."""
         config = self._config
-        planes = stacked([i.plane for i in others]).widened(config.pose_sigma_rad, config.pose_sigma_m)
-        position = instance.centroid_w
-        forth, back = gate(planes, instance.plane, position, config), gate(instance.plane, planes, position, config)
+        ours = stacked([i.plane for i in touched])[:, None]
+        theirs = stacked([i.plane for i in self._instances])[None].widened(config.pose_sigma_rad, config.pose_sigma_m)
+        origin = np.zeros(3)  # decides on offset ratios only, which are not used here
+        forth, back = gate(theirs, ours, origin, config), gate(ours, theirs, origin, config)
         sigmas = np.maximum(forth.deviation_sigmas, back.deviation_sigmas)
-        for i in np.flatnonzero(forth.admitted & back.admitted):
-            if self._coplanar(instance, others[i], float(sigmas[i])) and self._joined(instance, others[i], samples):
-                return others[i]
+        for i, j in np.argwhere(forth.admitted & back.admitted):
+            a, b = touched[i], self._instances[j]
+            if a is not b and self._coplanar(a, b, float(sigmas[i, j])) and self._joined(a, b, samples):
+                return a, b
         return None
 
     def _coplanar(self, a: PlanarInstance, b: PlanarInstance, sigmas: float) -> bool:
