@@ -45,12 +45,17 @@ def cell_moments(
     columns: ti.i32,  # cells a row
     moments: nd(ti.f32, ndim=2),  # [C, 10] of px from the cell's centre and of w - reference, out
     reference: nd(ti.f32, ndim=1),  # [C] 1/m, out
+    twist: nd(ti.f32, ndim=2),  # [C, 2] sum of squared twists, 1/m^2, and how many, out
 ):
-    """Moments of inverse depth over each cell's measurements."""
+    """Moments of inverse depth over each cell's measurements, and the twist w00 - w01 - w10 + w11 of 2 x 2 pixels.
+
+    A plane has no twist, nor has a straight step along a row or a column: white noise gives it 4 times its variance.
+    """
     for c in range(moments.shape[0]):
         top, bottom, left, right, x0, y0 = extent(c, cell, columns, depth.shape[0], depth.shape[1])
         w0 = 0.0
         sums = ti.Vector([0.0] * MOMENTS)
+        squares, twists = 0.0, 0.0
         for v in range(top, bottom):
             y = v - y0
             for u in range(left, right):
@@ -59,7 +64,15 @@ def cell_moments(
                     w0 = ti.select(w0 > 0.0, w0, 1.0 / z)
                     x, w = u - x0, 1.0 / z - w0
                     sums += ti.Vector([1.0, x, y, x * x, x * y, y * y, w, x * w, y * w, w * w])
+                    if v + 1 < bottom and u + 1 < right:
+                        a, b, d = depth[v, u + 1], depth[v + 1, u], depth[v + 1, u + 1]
+                        if a > 0.0 and b > 0.0 and d > 0.0:
+                            t = (1.0 / z - 1.0 / a) - (1.0 / b - 1.0 / d)
+                            squares += t * t
+                            twists += 1.0
         reference[c] = w0
+        twist[c, 0] = squares
+        twist[c, 1] = twists
         for k in ti.static(range(MOMENTS)):
             moments[c, k] = sums[k]
 

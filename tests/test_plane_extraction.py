@@ -276,3 +276,15 @@ def test_the_depth_image_is_left_alone(sources):
     before = depth_m.copy()
     extract_planes(runtime.to_device(depth_m), sources["desk"].camera, CONFIG, SIGMA)
     np.testing.assert_array_equal(depth_m, before)
+
+
+def test_a_sensor_noisier_than_assumed_still_shows_its_planes():
+    normal = np.array([0.1, -0.6, -1.0]) / np.linalg.norm([0.1, -0.6, -1.0])
+    exact_m = plane_depth(normal, 1.2)
+    noise = 3.0 * SIGMA * np.random.default_rng(0).normal(size=exact_m.shape)
+    view = seen(1.0 / (1.0 / exact_m + noise), None)
+    assert view.segments[0].area_px > 0.95 * exact_m.size
+    assert view.segments[0].rms_sigmas == pytest.approx(3.0, rel=0.05)
+    assert_true(view.segments[0], normal, 1.2, 0.05, 0.001)
+    error = deviation(view.segments[0], normal, 1.2)
+    assert error @ np.linalg.solve(view.segments[0].covariance, error) < 16.0

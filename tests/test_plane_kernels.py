@@ -39,15 +39,16 @@ def cell_labels_of(grid, seed=0):
 def test_cell_moments(height, width, cell):
     depth_m, camera, _ = scene(height, width)
     grid = plane_fit.CellGrid(camera, cell)
-    got = plane_fit.cell_moments(runtime.to_device(depth_m), grid)
+    got, noise = plane_fit.cell_moments(runtime.to_device(depth_m), grid)
     expected = reference.cell_moments(depth_m.astype(float), cell, camera.cx, camera.cy)
     np.testing.assert_allclose(got, expected, rtol=2e-6, atol=1e-4)
+    np.testing.assert_allclose(noise, reference.white_noise(depth_m.astype(float), cell), rtol=2e-3, atol=1e-12)
 
 
 def test_cell_residuals_keep_single_precision_of_the_noise():
     depth_m, camera, _ = scene(48, 64)
     grid = plane_fit.CellGrid(camera, 8)
-    got = squared_residuals(plane_fit.cell_moments(runtime.to_device(depth_m), grid))
+    got = squared_residuals(plane_fit.cell_moments(runtime.to_device(depth_m), grid)[0])
     expected = squared_residuals(reference.cell_moments(depth_m.astype(float), 8, camera.cx, camera.cy))
     np.testing.assert_allclose(got, expected, rtol=1e-3, atol=1e-3 * SIGMA**2)
 
@@ -94,7 +95,7 @@ def test_a_plane_without_noise_is_fitted_exactly(g0, gx, gy, seed):
     v, u = np.mgrid[:16, :16]
     depth_m = np.float32(1.0 / (g0 + gx * (u - camera.cx) + gy * (v - camera.cy)))
     depth_m[np.random.default_rng(seed).random((16, 16)) < 0.4] = 0.0
-    moments = plane_fit.cell_moments(runtime.to_device(depth_m), plane_fit.CellGrid(camera, 8))
+    moments, _ = plane_fit.cell_moments(runtime.to_device(depth_m), plane_fit.CellGrid(camera, 8))
     np.testing.assert_allclose(planes_of(moments), np.tile([g0, gx, gy], (4, 1)), atol=1e-6)
     first, second = np.array([0, 0, 1]), np.array([1, 2, 3])
     assert (joining_cost(moments, squared_residuals(moments), first, second) < 1e-3 * SIGMA**2).all()

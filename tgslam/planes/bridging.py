@@ -25,7 +25,7 @@ class Pieces:
     """Groups of cells with a plane each."""
 
     labels: Labels  # [rows, columns] of cells, -1 = none
-    moments: Floats  # [G, 10]
+    moments: Floats  # [G, 11] with the noise's variance
 
 
 def bridge(pieces: Pieces, depth_m: NDArray[np.float32], grid: CellGrid, agreement: Agreement) -> Pieces:

@@ -13,24 +13,33 @@ from tgslam.planes.moments import squared_residuals
 
 Indices = NDArray[np.intp]
 
+_FEWEST = 6  # measurements
+_NOISIEST = 5.0  # times as noisy as the sensor should be
+
 
 @dataclass(frozen=True)
 class CellGraph:
     """Planar cells as nodes; edges join neighbours on the four sides."""
 
     cell: Indices  # [N] index into the grid
-    moments: Floats  # [N, 10]
+    moments: Floats  # [N, 11] with the noise's variance
     edges: Indices  # [E, 2] nodes, the smaller first
 
 
 def planar_cells(depth_m: np.ndarray, grid: CellGrid, sigma: float, share: float, sigmas: float) -> CellGraph:
-    """Cells of which at least that share is measured, and whose residual is at most so many sigma (1/m)."""
-    moments = plane_fit.cell_moments(depth_m, grid)
+    """Cells of which at least that share is measured, and whose residual is at most so many times the noise.
+
+    The noise is sigma, 1/m, or where neighbouring pixels differ by more at random, as much more as they do: shape does
+    not look like that.
+    """
+    moments, white = plane_fit.cell_moments(depth_m, grid)
+    variance = np.clip(white, sigma**2, (_NOISIEST * sigma) ** 2)
     count = moments[:, 0]
-    freedom = np.maximum(count - 3, 1.0)
-    flat = (count >= max(share * grid.cell_px**2, 6)) & (squared_residuals(moments) <= (sigmas * sigma) ** 2 * freedom)
+    fits = squared_residuals(moments) <= sigmas**2 * variance * np.maximum(count - 3, 1.0)
+    flat = fits & (count >= max(share * grid.cell_px**2, _FEWEST))
     cell = np.flatnonzero(flat)
-    return CellGraph(cell, moments[cell], _neighbours(flat.reshape(grid.shape)))
+    nodes = np.column_stack([moments[cell], count[cell] * variance[cell]])
+    return CellGraph(cell, nodes, _neighbours(flat.reshape(grid.shape)))
 
 
 def _neighbours(flat: NDArray[np.bool_]) -> Indices:

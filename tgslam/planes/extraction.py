@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from tgslam.plane_fit import CellGrid, Floats, PixelLabels, SegmentSums
 from tgslam.planes.bridging import Pieces, bridge
 from tgslam.planes.cells import CellGraph, planar_cells
 from tgslam.planes.merging import Agreement, Indices, agglomerate
-from tgslam.planes.moments import joining_cost, planes_of, squared_residuals
+from tgslam.planes.moments import joining_cost, noise_of, planes_of, squared_residuals
 from tgslam.planes.segment import PlaneSegment, PlaneView
 from tgslam.planes.statistics import Evidence, evidence, refined, width_px
 from tgslam.types import Camera
@@ -22,6 +23,7 @@ _CHARBONNIER_SIGMAS = 1.5
 _RELIABLE_PART = 0.7  # of the limits beyond which there is no plane
 _PIECE_SHARE = 0.25  # of the least area, that pieces have before they are joined across gaps
 _MIN_CELLS = 2
+_FEWEST_PX = 6
 
 
 def extract_planes(depth_m: np.ndarray, camera: Camera, config: PlanesConfig, sigma_per_m2: float) -> PlaneView:
@@ -36,13 +38,15 @@ def extract_planes(depth_m: np.ndarray, camera: Camera, config: PlanesConfig, si
     if not len(pieces.moments):
         return PlaneView(np.full((camera.height, camera.width), -1, np.int32), ())
     pixels = PixelLabels(depth_m, grid, pieces.labels)
-    planes = planes_of(pieces.moments)
-    pixels.assign(planes, config.pixel_sigmas * _spread(pieces.moments, sigma_per_m2, config.max_rms_sigmas))
+    planes, noise = planes_of(pieces.moments), noise_of(pieces.moments)
+    spread = np.sqrt(squared_residuals(pieces.moments) / pieces.moments[:, 0])
+    pixels.assign(planes, config.pixel_sigmas * np.clip(spread, noise, config.max_rms_sigmas * noise))
     for _ in range(_ROBUST_ROUNDS):
         before = planes
         sums = pixels.sums(before, _CHARBONNIER_SIGMAS * sigma_per_m2)
         planes = refined(before, sums)
-    found = _judged(planes, planes - before, sums, grid, config, sigma_per_m2)
+    seen = _evidence(planes, planes - before, sums, grid, sigma_per_m2)
+    found = _judged(seen, noise / sigma_per_m2, camera.width * camera.height, config)
     number = np.full(len(planes) + 1, -1, np.int32)
     number[[index for index, _ in found]] = np.arange(len(found))
     return PlaneView(number[pixels.read()], tuple(segment for _, segment in found))
@@ -70,24 +74,25 @@ def _continuous(graph: CellGraph, agreement: Agreement) -> Indices:
     return graph.edges[agreement.admits(cost, graph.moments[first], graph.moments[second])]
 
 
-def _spread(moments: Floats, sigma: float, most_sigmas: float) -> Floats:
-    """[P] 1/m: standard deviation of the inverse depths about each plane, the sensor's at least."""
-    spread = np.sqrt(squared_residuals(moments) / np.maximum(moments[:, 0] - 3, 1.0))
-    return np.clip(spread, sigma, most_sigmas * sigma)
+def _evidence(
+    planes: Floats, change: Floats, sums: SegmentSums, grid: CellGrid, sigma: float
+) -> Iterator[tuple[int, Evidence]]:
+    """Index and evidence of those planes that have pixels in more than a line; change: [P, 3] since the sums."""
+    for index in range(len(planes)):
+        rows = sums.of(index)
+        if rows.pixels.sum() >= _FEWEST_PX and width_px(rows.moments.sum(axis=0)) >= 1.0:
+            yield index, evidence(planes[index], change[index], rows, grid, sigma)
 
 
 def _judged(
-    planes: Floats, change: Floats, sums: SegmentSums, grid: CellGrid, config: PlanesConfig, sigma: float
+    candidates: Iterable[tuple[int, Evidence]], noise_sigmas: Floats, image_px: int, config: PlanesConfig
 ) -> list[tuple[int, PlaneSegment]]:
-    """Index and segment of the largest ones that are planes; change: [P, 3] since the sums were taken."""
-    image_px = grid.camera.width * grid.camera.height
+    """Index and segment of the largest ones that are planes. noise_sigmas: [P] the noise as the sensor's standard."""
     found = []
-    for index in range(len(planes)):
-        rows = sums.of(index)
-        if rows.pixels.sum() < max(config.min_area_share * image_px, 6.0) or width_px(rows.moments.sum(axis=0)) < 1.0:
-            continue
-        seen = evidence(planes[index], change[index], rows, grid, sigma)
-        if seen.segment.rms_sigmas <= config.max_rms_sigmas and _bend(seen, config) <= 1.0:
+    for index, seen in candidates:
+        large = seen.segment.area_px >= config.min_area_share * image_px
+        smooth = seen.segment.rms_sigmas <= config.max_rms_sigmas * noise_sigmas[index]
+        if large and smooth and _bend(seen, config) <= 1.0:
             reliable = _is_reliable(seen, image_px, config)
             found.append((index, dataclasses.replace(seen.segment, reliable=reliable)))
     found.sort(key=lambda item: (-item[1].area_px, item[0]))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.plane_fit import Floats
-from tgslam.planes.moments import joining_cost, squared_residuals
+from tgslam.planes.moments import NOISE, joining_cost, squared_residuals
 
 Indices = NDArray[np.intp]
 
@@ -42,11 +42,12 @@ class Agreement:
         return cls(sigma, sigmas, min(_OVER_MEDIAN * np.sqrt(median) / sigma, most_shift_sigmas))
 
     def admits(self, cost: Floats, first: Floats, second: Floats) -> NDArray[np.bool_]:
-        """Whether the `joining_cost` [E], 1/m^2, of pairs of sets with those moments [E, 10] is small enough [E]."""
+        """Whether the `joining_cost` [E], 1/m^2, of pairs of sets with those moments [E, 11] is small enough [E]."""
         fewer = np.minimum(first[:, 0], second[:, 0])
         inverse_depth = (first[:, 6] + second[:, 6]) / np.maximum(first[:, 0] + second[:, 0], 1.0)
         shift = (self.shift_sigmas * self.sigma) ** 2 + (self.shift_m * inverse_depth**2) ** 2
-        return cost <= (self.sigmas * self.sigma) ** 2 + shift * fewer
+        variance = (first[:, NOISE] + second[:, NOISE]) / np.maximum(first[:, 0] + second[:, 0], 1.0)
+        return cost <= self.sigmas**2 * variance + shift * fewer
 
 
 def agglomerate(moments: Floats, edges: Indices, agreement: Agreement) -> tuple[Indices, Floats]:
@@ -55,7 +56,7 @@ def agglomerate(moments: Floats, edges: Indices, agreement: Agreement) -> tuple[
     Each round joins all the pairs that are each other's cheapest partner, which is what a queue of single joins arrives
     at: joining never makes a third set cheaper than it was for both (Ward's criterion is reducible). A set also joins
     its cheapest partner if that is very much larger, so that large planes do not take in their rims one by one.
-    moments: [N, 10] of the sets; edges: [E, 2]. Returns the group of each set [N], and the groups' moments [G, 10].
+    moments: [N, 11] of the sets; edges: [E, 2]. Returns the group of each set [N], and the groups' moments [G, 11].
     """
     group = np.arange(len(moments))
     while len(edges):

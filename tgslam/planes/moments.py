@@ -1,6 +1,7 @@
 """Least-squares planes from moments: many small fits at once, and what joining two sets of points costs.
 
-Moments [N, 10] and planes [N, 3] are those of `tgslam.plane_fit`: inverse depth affine in the pixel.
+Moments [N, 10] and planes [N, 3] are those of `tgslam.plane_fit`: inverse depth affine in the pixel. They may have an
+11th column, the variance of the points' noise, 1/m^2, summed over the points: it adds up as the moments do.
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+
+NOISE = 10  # column of the summed variance
 
 _SINGULAR = 1e-6  # of the product of the variances: points on a line
 
@@ -20,7 +23,7 @@ def squared_residuals(moments: Floats) -> Floats:
 
 def planes_of(moments: Floats) -> Floats:
     """[N, 3] best planes g0, gx, gy; where the points lie on a line or are too few, a plane without slope."""
-    n, x, y, *_, w = moments.T[:7]
+    n, x, y, w = moments.T[[0, 1, 2, 6]]
     _, gx, gy = _fitted(moments)
     return np.stack([(w - gx * x - gy * y) / np.maximum(n, 1e-12), gx, gy], axis=1)
 
@@ -29,6 +32,11 @@ def information(moments: Floats) -> Floats:
     """[3, 3] normal matrix over (g0, gx, gy) of one set's moments [10]."""
     n, x, y, xx, xy, yy = moments[:6]
     return np.array([[n, x, y], [x, xx, xy], [y, xy, yy]])
+
+
+def noise_of(moments: Floats) -> Floats:
+    """[N] 1/m: standard deviation of the points' noise."""
+    return np.sqrt(moments[:, NOISE] / np.maximum(moments[:, 0], 1.0))
 
 
 def joining_cost(moments: Floats, squares: Floats, first: NDArray[np.intp], second: NDArray[np.intp]) -> Floats:
@@ -43,7 +51,7 @@ def joining_cost(moments: Floats, squares: Floats, first: NDArray[np.intp], seco
 
 def _fitted(moments: Floats) -> tuple[Floats, Floats, Floats]:
     """Squared residuals and slopes gx, gy; each [N]."""
-    n, x, y, xx, xy, yy, w, xw, yw, ww = np.ascontiguousarray(moments.T)
+    n, x, y, xx, xy, yy, w, xw, yw, ww = np.ascontiguousarray(moments.T[:NOISE])
     inverse = 1.0 / np.maximum(n, 1e-12)
     mx, my, mw = x * inverse, y * inverse, w * inverse
     xx, xy, yy = xx - mx * x, xy - mx * y, yy - my * y
