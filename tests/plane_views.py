@@ -163,3 +163,93 @@ class Playback:
             if largest[label] >= least_area_m2:
                 result.setdefault(label, []).append(self.registry.resolve(plane_id) if plane_id >= 0 else -1)
         return result
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A flat surface of a scene that a test makes up, seen from both sides."""
+
+    centre: tuple[float, float, float]  # m, world
+    along: tuple[float, float, float]  # unit
+    across: tuple[float, float, float]  # unit
+    size: tuple[float, float]  # m
+
+    @property
+    def plane(self) -> np.ndarray:
+        """[4] normal along x across, offset."""
+        normal = np.cross(self.along, self.across)
+        return np.append(normal, -normal @ np.asarray(self.centre))
+
+
+def cast(rectangles: list[Rectangle], camera: Camera, T_cw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Exact depth [H, W] m and the index of the rectangle seen at each pixel, -1 = none."""
+    T_wc = inverse(T_cw)
+    rays = points_c(camera, np.ones((camera.height, camera.width))) @ T_wc[:3, :3].T
+    depth, labels = np.full(rays.shape[:2], np.inf), np.full(rays.shape[:2], -1)
+    for i, rectangle in enumerate(rectangles):
+        plane = rectangle.plane
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = -(plane[:3] @ T_wc[:3, 3] + plane[3]) / (rays @ plane[:3])
+            offset = rays * z[..., None] + T_wc[:3, 3] - rectangle.centre
+            hit = (np.abs(offset @ rectangle.along) <= rectangle.size[0] / 2) & (z > 0.05) & (z < depth)
+            hit &= np.abs(offset @ rectangle.across) <= rectangle.size[1] / 2
+        depth[hit], labels[hit] = z[hit], i
+    return np.where(np.isfinite(depth), depth, 0.0).astype(np.float32), labels
+
+
+def looking(position: tuple[float, float, float], target: tuple[float, float, float]) -> np.ndarray:
+    """T_cw [4, 4] of a camera at `position` that looks at `target`, world z up."""
+    forward = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    T_wc = np.eye(4)
+    T_wc[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    T_wc[:3, 3] = position
+    return inverse(T_wc)
+
+
+@dataclass
+class Stage:
+    """Rectangles shown to a registry from given poses; sees what a Playback does, of a scene made up by a test."""
+
+    rectangles: list[Rectangle]
+    config: PlanesConfig = field(default_factory=PlanesConfig)
+    camera: Camera = field(default_factory=lambda: Camera(200, 150, 140.0, 140.0, 99.5, 74.5))
+
+    def __post_init__(self) -> None:
+        self.registry = PlaneRegistry(self.config, DEPTH_SIGMA_PER_M2)
+        self.rng = np.random.default_rng(5)
+        self.keyframe = -1
+
+    def show(
+        self,
+        T_cw: np.ndarray,
+        believed: np.ndarray | None = None,
+        unreliable: tuple[int, ...] = (),
+        rectangles: list[Rectangle] | None = None,
+        pieces: int = 1,
+    ) -> tuple[Observation, dict[int, list[int]]]:
+        """A keyframe at T_cw, which is taken to be at `believed`. Returns with the ids that each rectangle got."""
+        shown = self.rectangles if rectangles is None else rectangles
+        depth_m, labels = cast(shown, self.camera, T_cw)
+        noise = DEPTH_SIGMA_PER_M2 * depth_m**2 * self.rng.standard_normal(depth_m.shape)
+        planes = np.array([rectangle.plane for rectangle in shown])
+        normals = planes[:, :3] @ T_cw[:3, :3].T
+        planes_c = np.column_stack([normals, planes[:, 3] - normals @ T_cw[:3, 3]])
+        view, truth = view_from_labels(self.camera, depth_m, labels, planes_c, self.rng, pieces)
+        segments = tuple(
+            replace(segment, reliable=int(label) not in unreliable)
+            for segment, label in zip(view.segments, truth, strict=True)
+        )
+        self.keyframe += 1
+        seen = self.registry.observe(
+            replace(view, segments=segments),
+            (depth_m + noise).astype(np.float32),
+            self.camera,
+            T_cw if believed is None else believed,
+            self.keyframe,
+        )
+        ids: dict[int, list[int]] = {}
+        for label, plane_id in zip(truth, seen.ids, strict=True):
+            ids.setdefault(int(label), []).append(int(plane_id))
+        return seen, ids
