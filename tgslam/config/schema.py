@@ -156,7 +156,7 @@ class PlanesConfig:
     cell_sigmas: float = setting(1.4, 0.1, 100.0)  # a cell whose residual is more is not plane
     join_sigmas: float = setting(6.0, 0.1, 100.0)  # deviation of two planes under their covariances
     join_shift_sigmas: float = setting(1.2, 0.0, 100.0)  # and beyond: of a pixel, joining shifts planes at most so far
-    join_shift_m: float = setting(0.008, 0.0, 1.0)  # likewise, of depth, on a surface without steps
+    join_shift_m: float = setting(0.01, 0.0, 1.0)  # likewise, of depth, on a surface without steps
     pixel_sigmas: float = setting(3.0, 0.5, 100.0)  # of a pixel from its plane
     min_area_share: float = setting(0.004, 0.0, 1.0)  # of the image
     max_rms_sigmas: float = setting(2.5, 0.1, 100.0)  # residual beyond which a segment is not plane
