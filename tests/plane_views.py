@@ -15,6 +15,7 @@ from tgslam.types import Camera
 
 DEPTH_SIGMA_PER_M2 = 0.0015
 LEAST_AREA_SHARE = 0.004  # of the image that a segment takes
+RELIABLE_AREA_SHARE = 0.01  # below, a segment is ambiguous
 
 
 def points_c(camera: Camera, depth_m: np.ndarray) -> np.ndarray:
@@ -88,7 +89,7 @@ def view_from_labels(
         if np.median(cosine) < 0.1:
             continue
         result[mask] = len(segments)
-        segments.append(segment_of(own, plane, areas, rng))
+        segments.append(segment_of(own, plane, areas, rng, reliable=len(own) >= RELIABLE_AREA_SHARE * labels.size))
         truth.append(label % len(planes_c))
     return PlaneView(result, tuple(segments)), np.array(truth, int)
 
@@ -154,14 +155,17 @@ class Playback:
         return self
 
     def ids_of_planes(self, least_area_m2: float = 0.2) -> dict[int, list[int]]:
-        """For each true plane seen with so much area at once: the ids it had, after merges, in order of time."""
-        largest: dict[int, float] = {}
+        """For each true plane that the views show with so much area (median): its ids, after merges, by time.
+
+        Deferred sightings are left out.
+        """
+        areas: dict[int, list[float]] = {}
         for _, label, _, area in self.sightings:
-            largest[label] = max(largest.get(label, 0.0), area)
+            areas.setdefault(label, []).append(area)
         result: dict[int, list[int]] = {}
         for _, label, plane_id, _ in self.sightings:
-            if largest[label] >= least_area_m2:
-                result.setdefault(label, []).append(self.registry.resolve(plane_id) if plane_id >= 0 else -1)
+            if plane_id >= 0 and np.median(areas[label]) >= least_area_m2:
+                result.setdefault(label, []).append(self.registry.resolve(plane_id))
         return result
 
 
