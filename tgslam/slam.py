@@ -18,6 +18,8 @@ from tgslam.geometry import inverse, orthonormalized
 from tgslam.keyframes import KeyframeSelector
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.mapper import Mapper
+from tgslam.mapping.structure import Structure
+from tgslam.planes.cue import StructureCue
 from tgslam.tracking.exposure import Exposure
 from tgslam.tracking.motion import ConstantVelocity
 from tgslam.tracking.result import TrackingResult
@@ -46,7 +48,9 @@ class Slam:
         self.motion = ConstantVelocity()
         self.selector = KeyframeSelector(config.keyframes)
         rng = np.random.default_rng(config.seed)
-        self.mapper = Mapper(camera, config.mapping, config.seeding, config.loss, rng)
+        self.structure = Structure(camera, config.planes, self.sigma_per_m2) if config.planes.enabled else None
+        self.structure_cue = StructureCue(config.planes)
+        self.mapper = Mapper(camera, config.mapping, config.seeding, config.loss, rng, self.structure)
         self.exposure = Exposure()
         self._posed: list[_Posed] = []
         self._stage_s: dict[str, float] = {}
@@ -108,7 +112,8 @@ class Slam:
 
     def _keyframe_cue(self, frame: Frame, result: TrackingResult) -> str:
         seen = self.tracker.rasterizer.visible(self.mapper.gaussians.count)
-        return self.selector.cue(frame, result.T_cw, seen, 1.0 - result.measures["overlap"])
+        appearance = self.selector.cue(frame, result.T_cw, seen, 1.0 - result.measures["overlap"])
+        return appearance or self.structure_cue.cue(result.T_cw)
 
     def _map(self, frame: Frame, result: TrackingResult) -> None:
         keyframe = Keyframe.from_frame(frame, result.T_cw, result.exposure, result.information)
@@ -117,6 +122,8 @@ class Slam:
         self._posed.append(_Posed(frame.timestamp_s, keyframe, np.eye(4)))
         self.tracker.rasterizer.forward(self.mapper.gaussians, keyframe.T_cw)
         self.selector.reset(frame, keyframe.T_cw, self.tracker.rasterizer.visible(self.mapper.gaussians.count))
+        if self.structure:
+            self.structure_cue.reset(self.structure.seen_from(len(self.mapper.keyframes) - 1), keyframe.T_cw)
 
     def _remember(self, frame: Frame, T_cw: NDArray[np.float64]) -> None:
         keyframe = self.mapper.keyframes[-1]

@@ -114,7 +114,9 @@ class SeedingConfig:
 
     smallest_cell_px: int = setting(2, 1, 64)  # cells at edges, texture and off planes
     cell_levels: int = setting(3, 1, 6)  # of the quadtree: the largest cell is 2^(levels - 1) times the smallest
+    plane_cell_levels: int = setting(5, 1, 8)  # likewise for cells on one plane (PGI)
     plain_colour_std: float = setting(0.015, 0.0, 1.0)  # a cell whose channels vary less has no texture
+    plane_colour_std: float = setting(0.02, 0.0, 1.0)  # likewise for a cell on one plane, but for a linear trend
     planar_sigmas: float = setting(2.0, 0.0, 100.0)  # a cell whose plane residual is less, in sensor sigmas, is flat
     overlap: float = setting(0.6, 0.1, 3.0)  # standard deviation of a Gaussian in cell sizes
     thickness: float = setting(0.1, 1e-3, 1.0)  # standard deviation along the normal, relative to across
@@ -149,6 +151,7 @@ class MappingConfig:
 class PlanesConfig:
     """Planes of single views, and the persistent ones (PGIs, section 3.3) that they are matched to."""
 
+    enabled: bool = setting(True)  # False: the map knows nothing of planes
     # Segments of single views (section 3.2); sigmas are of the sensor's inverse depth at a pixel
     max_segments: int = setting(10, 1, 1000)  # K: the largest ones are kept
     cell_px: int = setting(8, 4, 64)  # squares of pixels that segmentation starts from

@@ -15,6 +15,7 @@ from tgslam.mapping.fusion import block_centre, depth_pyramid, fused_depth, samp
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.refinement import Refiner
 from tgslam.mapping.seeding import cell_sizes, quadtree, seed
+from tgslam.mapping.structure import PlanarPixels, Structure, projected
 from tgslam.types import Camera
 
 _NEAR_M = 0.05
@@ -27,8 +28,16 @@ class Mapper:
     """Owns the Gaussians and the keyframes."""
 
     def __init__(
-        self, camera: Camera, mapping: MappingConfig, seeding: SeedingConfig, loss: LossConfig, rng: np.random.Generator
+        self,
+        camera: Camera,
+        mapping: MappingConfig,
+        seeding: SeedingConfig,
+        loss: LossConfig,
+        rng: np.random.Generator,
+        structure: Structure | None = None,
     ) -> None:
+        """structure: finds planes and makes use of them; None = the map knows nothing of planes."""
+        self.structure = structure
         self.camera, self.config, self.seeding, self.loss, self.rng = camera, mapping, seeding, loss, rng
         self.gaussians = GaussianMap()
         self.keyframes: list[Keyframe] = []
@@ -46,10 +55,14 @@ class Mapper:
         )
         self.conflict += surface.seen_through
         self.support += surface.supported
-        kept = ~(self.guessed & surface.measured) & ~self._too_coarse(keyframe, surface)
+        planes = self.structure.observe(keyframe, len(self.keyframes) - 1) if self.structure else None
+        kept = ~(self.guessed & surface.measured) & ~self._too_coarse(keyframe, surface, planes)
         self._keep(kept)
         self._fuse(keyframe, surface, kept)
-        self._insert(keyframe)
+        self._insert(keyframe, planes)
+        if self.structure and planes:
+            rows, v, u = projected(self.gaussians, self.camera, keyframe.T_cw)
+            self.structure.label(self.gaussians, rows, planes.ids[v, u])
         for view in self._schedule(self.config.iterations):
             self.refiner.step(self.gaussians, view, move_pose=self._may_move(view))
         self._prune()
@@ -61,16 +74,22 @@ class Mapper:
                 self.refiner.step(self.gaussians, self.keyframes[k], move_pose=False)
         self._prune()
 
-    def _insert(self, keyframe: Keyframe) -> None:
+    def _insert(self, keyframe: Keyframe, planes: PlanarPixels | None) -> None:
         """Seed Gaussians where the map is open; where no depth was measured, at a guessed one."""
         measured_m = keyframe.depth_m()
         wanted = self._unexplained(keyframe, measured_m)
         depth_m = filled(measured_m)
         colour = keyframe.exposure.gain * keyframe.colour() + np.float32(keyframe.exposure.bias)
-        cells = quadtree(colour, depth_m, wanted, self.seeding, self.loss.depth_sigma_per_m2)
-        normals = images.normals(runtime.to_device(depth_m), self.camera, sigma_per_m2=self.loss.depth_sigma_per_m2)
+        normals_c = runtime.to_host(
+            images.normals(runtime.to_device(depth_m), self.camera, sigma_per_m2=self.loss.depth_sigma_per_m2)
+        )
+        if planes:
+            depth_m = np.where((planes.depth_m > 0) & (measured_m <= 0), planes.depth_m, depth_m)
+            normals_c = np.where(planes.depth_m[..., None] > 0, planes.normals_c, normals_c)
+        ids = planes.ids if planes else None
+        cells = quadtree(colour, depth_m, wanted, self.seeding, self.loss.depth_sigma_per_m2, ids)
         born = len(self.keyframes) - 1
-        new = seed(cells, runtime.to_host(normals), self.camera, keyframe.T_cw, born, self.seeding)
+        new = seed(cells, normals_c, self.camera, keyframe.T_cw, born, self.seeding, ids)
         self.gaussians.append(new)
         self.refiner.append(len(new))
         guessed = measured_m[np.rint(cells.v).astype(int), np.rint(cells.u).astype(int)] <= 0
@@ -126,13 +145,16 @@ class Mapper:
         """Standard deviation of the sensor's depth."""
         return self.loss.depth_sigma_per_m2 * depth_m**2
 
-    def _too_coarse(self, keyframe: Keyframe, surface: _Surface) -> NDArray[np.bool_]:
+    def _too_coarse(self, keyframe: Keyframe, surface: _Surface, planes: PlanarPixels | None) -> NDArray[np.bool_]:
         """[N] Gaussians on the keyframe's surface that are much larger in it than it would seed there today.
 
         They were seeded from afar. Only those well inside the image go, so that the keyframe fills all that they leave.
         """
         colour, depth_m = keyframe.colour(), keyframe.depth_m()
-        sizes = cell_sizes(colour, depth_m, self.seeding, self.loss.depth_sigma_per_m2)
+        if planes:
+            depth_m = np.where(planes.depth_m > 0, planes.depth_m, depth_m)
+        ids = planes.ids if planes else None
+        sizes = cell_sizes(colour, depth_m, self.seeding, self.loss.depth_sigma_per_m2, ids)
         wanted_px = np.zeros(len(surface.z))
         smallest = self.seeding.smallest_cell_px
         wanted_px[surface.inside] = sizes[surface.v // smallest, surface.u // smallest]

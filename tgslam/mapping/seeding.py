@@ -12,6 +12,7 @@ from tgslam import runtime
 from tgslam.config.schema import SeedingConfig
 from tgslam.geometry import inverse, quat_wxyz_from_matrices, transform_points
 from tgslam.kernels import seeding as kernels
+from tgslam.planes.palette import embedding_of
 from tgslam.types import Camera, Gaussians
 
 _MIN_COSINE = 0.25  # foreshortening is compensated up to here: beyond, a cell's Gaussian would become a needle
@@ -29,23 +30,54 @@ class Cells:
 
 
 def cell_sizes(
-    colour: NDArray[np.floating], depth_m: NDArray[np.floating], config: SeedingConfig, sigma_per_m2: float
+    colour: NDArray[np.floating],
+    depth_m: NDArray[np.floating],
+    config: SeedingConfig,
+    sigma_per_m2: float,
+    plane_ids: NDArray[np.int32] | None = None,
 ) -> NDArray[np.int32]:
     """The quadtree of a frame: the size in pixels of the cell at each of its smallest cells, [rows, columns].
 
     It is as large as the surface allows: a larger one is plain and planar (`kernels.seeding`). Rows and columns are
-    those of the frame with zeros at the right and bottom, so that the largest cells tile it.
+    those of the frame with zeros at the right and bottom, so that the largest cells tile it. plane_ids: [H, W] PGI of
+    each pixel, -1 = none; on one of them cells may be larger still, and the colour need only be plain but for a trend.
     """
-    device = runtime.to_device(colour), runtime.to_device(depth_m)
-    rows, columns = _tiles(depth_m, config)
-    sizes = np.full((rows, columns), config.smallest_cell_px, np.int32)
-    for level in range(1, config.cell_levels):
-        size, step = config.smallest_cell_px << level, 1 << level
-        cells = runtime.empty((rows >> level, columns >> level), np.int32)
-        kernels.plain_and_planar(*device, size, config.plain_colour_std, config.planar_sigmas * sigma_per_m2, cells)
-        whole = runtime.to_host(cells) > 0
-        sizes[np.repeat(np.repeat(whole, step, 0), step, 1)] = size
+    whole = _whole_cells(colour, depth_m, config, sigma_per_m2, plane_ids)
+    sizes = np.full(whole[0].shape, config.smallest_cell_px, np.int32)
+    for level in range(1, len(whole)):
+        sizes[_spread(whole[level], 1 << level) > 0] = config.smallest_cell_px << level
     return sizes
+
+
+def _whole_cells(
+    colour: NDArray[np.floating],
+    depth_m: NDArray[np.floating],
+    config: SeedingConfig,
+    sigma_per_m2: float,
+    plane_ids: NDArray[np.int32] | None,
+) -> list[NDArray[np.int32]]:
+    """By level [rows, columns] of `kernels.seeding`: the cells that one Gaussian can stand for, or that lie in such."""
+    device = runtime.to_device(colour), runtime.to_device(depth_m)
+    levels = config.cell_levels if plane_ids is None else max(config.cell_levels, config.plane_cell_levels)
+    rows, columns = _tiles(depth_m, config, levels)
+    ids = np.full(depth_m.shape, -1, np.int32) if plane_ids is None else plane_ids
+    device_ids = runtime.to_device(ids, np.int32)
+    whole = [np.zeros((rows, columns), np.int32)]
+    for level in range(1, levels):
+        cells = runtime.empty((rows >> level, columns >> level), np.int32)
+        kernels.plain_and_planar(
+            *device, device_ids, config.smallest_cell_px << level, config.plain_colour_std, config.plane_colour_std,
+            config.planar_sigmas * sigma_per_m2, level >= config.cell_levels, cells,
+        )  # fmt: skip
+        whole.append(runtime.to_host(cells))
+    for level in reversed(range(1, levels - 1)):
+        whole[level] = np.maximum(whole[level], _spread(whole[level + 1], 2))
+    return whole
+
+
+def _spread(cells: NDArray[np.int32], step: int) -> NDArray[np.int32]:
+    """Every cell step x step times."""
+    return np.repeat(np.repeat(cells, step, 0), step, 1)
 
 
 def quadtree(
@@ -54,35 +86,40 @@ def quadtree(
     wanted: NDArray[np.bool_],
     config: SeedingConfig,
     sigma_per_m2: float,
+    plane_ids: NDArray[np.int32] | None = None,
 ) -> Cells:
     """Cells that cover the `wanted` pixels [H, W] with depth, from the largest size down to `smallest_cell_px`.
 
     A cell that is wanted only in part is split; of the smallest ones, those are used that are wanted in half or more of
-    their pixels with depth.
+    their pixels with depth. plane_ids: as for `cell_sizes`. On a plane, where Gaussians may overlap without harm, cells
+    of every size are used that are wanted in half or more, and nothing smaller than the second size.
     """
-    desired = cell_sizes(colour, depth_m, config, sigma_per_m2)
-    shape = (desired.shape[0] * config.smallest_cell_px, desired.shape[1] * config.smallest_cell_px)
+    whole = _whole_cells(colour, depth_m, config, sigma_per_m2, plane_ids)
+    shape = (whole[0].shape[0] * config.smallest_cell_px, whole[0].shape[1] * config.smallest_cell_px)
     depth, rgb = _padded(depth_m, shape), _padded(colour, shape)
     valid = depth > 0
-    counts = _pyramid_of_counts(valid, config)
-    needs = _pyramid_of_counts(valid & _padded(wanted, shape), config)
+    counts = _pyramid_of_counts(valid, config, len(whole))
+    needs = _pyramid_of_counts(valid & _padded(wanted, shape), config, len(whole))
     open_cells = np.ones(counts[-1].shape, bool)
     found = []
-    for level in reversed(range(config.cell_levels)):
+    for level in reversed(range(len(whole))):
         count, needed, size = counts[level], needs[level], config.smallest_cell_px << level
+        mostly = (2 * needed >= count) & (count > 0)
+        on_plane = whole[level] == kernels.ON_PLANE
         if level:
-            use = open_cells & (desired[:: 1 << level, :: 1 << level] >= size) & (needed == count) & (count > 0)
+            use = open_cells & mostly & (on_plane | ((whole[level] > 0) & (needed == count)))
         else:
-            use = open_cells & (2 * needed >= count) & (count > 0)
+            use = open_cells & mostly
         found.append(_means(use, depth, rgb, size))
         if level:
-            open_cells = np.repeat(np.repeat(open_cells & ~use, 2, 0), 2, 1)
+            crumbs = on_plane & ~mostly if level == 1 else np.zeros(use.shape, bool)
+            open_cells = np.repeat(np.repeat(open_cells & ~use & ~crumbs, 2, 0), 2, 1)
     return Cells(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 
-def _tiles(image: NDArray[Any], config: SeedingConfig) -> tuple[int, int]:
+def _tiles(image: NDArray[Any], config: SeedingConfig, levels: int) -> tuple[int, int]:
     """Rows and columns of smallest cells that the largest cells over an image [H, W] hold."""
-    split = 1 << (config.cell_levels - 1)
+    split = 1 << (levels - 1)
     largest = config.smallest_cell_px * split
     return -(-image.shape[0] // largest) * split, -(-image.shape[1] // largest) * split
 
@@ -95,10 +132,10 @@ def _padded(image: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:
     return np.pad(image, padding + [(0, 0)] * (image.ndim - 2))
 
 
-def _pyramid_of_counts(mask: NDArray[np.bool_], config: SeedingConfig) -> list[NDArray[np.int32]]:
+def _pyramid_of_counts(mask: NDArray[np.bool_], config: SeedingConfig, levels: int) -> list[NDArray[np.int32]]:
     """How many pixels of each cell are set, from the smallest cells up."""
     counts = [_block_sums(mask, config.smallest_cell_px)]
-    for _ in range(1, config.cell_levels):
+    for _ in range(1, levels):
         counts.append(_block_sums(counts[-1], 2))
     return counts
 
@@ -139,15 +176,19 @@ def seed(
     T_cw: NDArray[np.float64],
     keyframe: int,
     config: SeedingConfig,
+    plane_ids: NDArray[np.int32] | None = None,
 ) -> Gaussians:
     """One flat Gaussian a cell, in the world frame: aligned with the surface, as wide as the cell's footprint.
 
     normals: [H, W, 3] in the camera frame towards the camera, 0 = unknown (then the viewing direction is used).
+    plane_ids: [H, W] PGI of each pixel, -1 = none.
     """
     n = len(cells.u)
+    row, column = np.rint(cells.v).astype(int), np.rint(cells.u).astype(int)
+    ids = np.full(n, -1, np.int32) if plane_ids is None else plane_ids[row, column]
     ray = np.stack([(cells.u - camera.cx) / camera.fx, (cells.v - camera.cy) / camera.fy, np.ones(n)], -1)
     towards = -ray / np.linalg.norm(ray, axis=-1, keepdims=True)
-    normal = normals[np.rint(cells.v).astype(int), np.rint(cells.u).astype(int)].astype(np.float64)
+    normal = normals[row, column].astype(np.float64)
     known = (normal * towards).sum(-1) > 0.05
     normal = np.where(known[:, None], normal, towards)
     cosine = np.maximum((normal * towards).sum(-1), _MIN_COSINE)
@@ -169,7 +210,7 @@ def seed(
         quat_wxyz=quat_wxyz_from_matrices(axes).astype(np.float32),
         opacity_logit=np.full(n, np.log(config.opacity / (1.0 - config.opacity)), np.float32),
         colour=cells.colour.astype(np.float32),
-        embedding=np.zeros((n, 3), np.float32),
-        plane_id=np.full(n, -1, np.int32),
+        embedding=np.zeros((n, 3), np.float32) if plane_ids is None else embedding_of(ids),
+        plane_id=ids.astype(np.int32),
         birth_keyframe=np.full(n, keyframe, np.int32),
     )
