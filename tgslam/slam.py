@@ -22,7 +22,7 @@ from tgslam.tracking.exposure import Exposure
 from tgslam.tracking.motion import ConstantVelocity
 from tgslam.tracking.result import TrackingResult
 from tgslam.tracking.solver import make_tracker, track_or_recover
-from tgslam.types import Camera, Frame, FrameReport, FrameStatus, Gaussians, Trajectory
+from tgslam.types import Camera, Frame, FrameReport, FrameStatus, Gaussians, Plane, Trajectory
 
 _MIN_DEPTH_SHARE = 0.01  # a frame with depth in fewer of its pixels is not usable
 _FALLBACKS = 3  # latest keyframes from which a lost camera is sought
@@ -96,6 +96,10 @@ class Slam:
     def gaussians(self) -> Gaussians:
         """The map, on the host."""
         return self.mapper.gaussians.gaussians()
+
+    def planes(self) -> tuple[Plane, ...]:
+        """The persistent planes by id, empty when planes are not looked for."""
+        return ()
 
     def _track(self, frame: Frame) -> TrackingResult:
         predicted = self.motion.predict(frame.timestamp_s)
