@@ -199,6 +199,29 @@ class PlanesConfig:
 
 
 @dataclass(frozen=True)
+class StructureConfig:
+    """What planes ask of the map: the instance field (Eqs. 1-4) and the regularisers (Eqs. 8, 9), as of Eq. 14."""
+
+    lambda_pgi: float = setting(0.1, 0.0, 100.0)  # what E_pgi weighs for geometry; 0 = no instance field
+    identity: str = setting("colour", choices=("colour", "scalar"))  # what a Gaussian carries of its plane's id
+    scalar_ids: int = setting(64, 1, 100_000)  # with identity: scalar, ids that can be told apart
+    pgi_interval: int = setting(3, 1, 1000)  # a keyframe's first refinement and every n-th one after see its planes
+    charbonnier_pgi: float = setting(0.1, 1e-6, 1.0)  # epsilon of Eq. 4, colour in [0, 1]
+    edge_boost: float = setting(2.0, 0.0, 100.0)  # pixels at a boundary weigh 1 + this
+    weight_none: float = setting(0.5, 0.0, 1.0)  # weight of measured pixels that are on no plane
+    relaxation: float = setting(1.0, 0.0, 1.9)  # of embeddings; 1 = the full step
+    read_margin: float = setting(0.05, 0.0, 1.0)  # ids are read where no other code is less than this farther
+    read_opacity: float = setting(0.5, 0.01, 1.0)  # and rendered opacity is at least this
+    lambda_str: float = setting(0.1, 0.0, 100.0)  # what E_str weighs; 0 = no regularisers
+    omega_flat: float = setting(1.0, 0.0, 100.0)  # of Eq. 8, scales relative to sqrt(s1 s2)
+    omega_normal: float = setting(1.0, 0.0, 100.0)  # of Eq. 9
+    omega_distance: float = setting(0.1, 0.0, 100.0)  # of the distance to the plane, in sigmas
+    thinness: float = setting(0.1, 0.0, 1.0)  # k of Eq. 8
+    sigma_distance_m: float = setting(0.01, 1e-5, 1.0)
+    charbonnier_distance_sigmas: float = setting(1.0, 1e-3, 100.0)  # epsilon of the distance
+
+
+@dataclass(frozen=True)
 class EvaluationConfig:
     """The fixed protocol: held-out frames never reach mapping, and keyframes are never held out."""
 
@@ -220,4 +243,5 @@ class Config:
     mapping: MappingConfig = dataclasses.field(default_factory=MappingConfig)
     planes: PlanesConfig = dataclasses.field(default_factory=PlanesConfig)
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
+    structure: StructureConfig = dataclasses.field(default_factory=StructureConfig)
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)

@@ -1,0 +1,83 @@
+"""What planes ask of the map in a refinement step: E_pgi (Eq. 4) and E_str (Eqs. 8, 9)."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tgslam import instance_field, runtime
+from tgslam.config.schema import StructureConfig
+from tgslam.gaussian_map import GaussianMap, MapGradient
+from tgslam.instance_field import InstanceGradient, InstanceTarget
+from tgslam.mapping.keyframe import Keyframe
+from tgslam.plane_regularisers import PlaneRegularisers
+from tgslam.planes.codes import code_table
+from tgslam.splatting.images import RenderImages
+from tgslam.types import Camera
+
+
+class StructureTerms:
+    """The terms with their scratch memory, and what they know of planes and keyframes."""
+
+    def __init__(self, camera: Camera, config: StructureConfig, kept_targets: int) -> None:
+        """kept_targets: keyframes whose prepared images are kept, the most recently used ones."""
+        self.config = config
+        self._kept_targets = kept_targets
+        self._workspace = instance_field.Workspace(camera.height, camera.width)
+        self._regularisers = PlaneRegularisers(config)
+        self._targets: OrderedDict[int, tuple[NDArray[np.int16], InstanceTarget]] = OrderedDict()
+        self._visits: dict[int, int] = {}  # by keyframe
+        self.set_planes(np.zeros((0, 4)), np.zeros(0, np.int32))
+
+    def set_planes(self, planes_w: NDArray[np.floating], ids: NDArray[np.integer]) -> None:
+        """The planes as they are now; call it when one was added, refitted, merged or removed.
+
+        planes_w: [P, 4] unit normal and offset in m by plane id, world; a row of zeros is no plane. ids: [P] the id
+        under which each lives on after merges (mostly its own; its row of planes_w is then that one's), -1 = removed.
+        """
+        self._planes = runtime.to_device(planes_w)
+        self._codes = runtime.to_device(code_table(ids, self.config))
+
+    def due(self, keyframe: Keyframe) -> InstanceTarget | None:
+        """The keyframe's target, if E_pgi takes part in this step: embeddings converge in few, so not in each."""
+        if keyframe.plane_ids is None or self.config.lambda_pgi == 0.0:
+            return None
+        visit = self._visits.get(keyframe.index, 0)
+        self._visits[keyframe.index] = visit + 1
+        return self._target(keyframe, keyframe.plane_ids) if visit % self.config.pgi_interval == 0 else None
+
+    def pgi(self, rendered: RenderImages, target: InstanceTarget, g_opacity: np.ndarray) -> InstanceGradient:
+        """E_pgi at a rendering; its derivative by opacity is added to g_opacity [H, W]."""
+        return instance_field.pgi_loss(
+            rendered.embedding, rendered.opacity, target, self._codes, self.config, g_opacity, self._workspace
+        )
+
+    def regularise(self, gaussians: GaussianMap, visible: np.ndarray, gradient: MapGradient) -> None:
+        """Add the gradient of E_str."""
+        if self.config.lambda_str > 0.0 and self._planes.shape[0]:
+            self._regularisers.add(gaussians, visible, self._planes, gradient)
+
+    def move_embeddings(
+        self, gaussians: GaussianMap, visible: np.ndarray, gradient: MapGradient, target: InstanceTarget
+    ) -> None:
+        """Relax the embeddings; the curvature's second column must hold the weights of E_pgi."""
+        instance_field.relax(
+            gaussians.count, visible, gradient.embedding, gradient.curvature, target, self.config, gaussians.embedding
+        )
+
+    @property
+    def parts(self) -> dict[str, float]:
+        """Means of E_str's terms in the last step that had it: flat, normal, distance; count of Gaussians."""
+        return self._regularisers.parts
+
+    def _target(self, keyframe: Keyframe, plane_ids: NDArray[np.int16]) -> InstanceTarget:
+        known = self._targets.pop(keyframe.index, None)
+        if known is None or known[0] is not plane_ids:
+            depth_m = runtime.to_device(keyframe.depth_m())
+            known = plane_ids, instance_field.prepare(plane_ids, depth_m, self.config)
+        self._targets[keyframe.index] = known
+        while len(self._targets) > self._kept_targets:
+            self._targets.popitem(last=False)
+        return known[1]
