@@ -145,6 +145,24 @@ def test_two_coplanar_table_tops_stay_two(sideways_m: float) -> None:
     assert -1 not in ids[0] + ids[1]
 
 
+def test_table_tops_stay_two_before_a_partition_that_hides_the_far_end_of_their_gap() -> None:
+    partition = Rectangle((0.0, 2.44, 0.7), (1, 0, 0), (0, 0, 1), (3.0, 1.4))
+    stage = Stage([*TABLES, partition, FLOOR])
+    for x in np.linspace(-0.5, 0.5, 5):
+        _, ids = stage.show(looking((float(x), 0.3, 1.5), (0.0, 2.0, 0.75)))
+        assert ids[0] != ids[1]
+    assert len(stage.registry.instances) == 4
+
+
+@pytest.mark.parametrize(("width_m", "surfaces"), [(1.6, 1), (0.8, 2)])
+def test_a_gap_that_no_view_shows_parts_small_surfaces_only(width_m: float, surfaces: int) -> None:
+    tops = [Rectangle((x, 2.0, 0.75), (1, 0, 0), (0, 1, 0), (width_m, 0.9)) for x in (-width_m, width_m)]
+    stage = Stage(tops)
+    for x in (-width_m, width_m):
+        stage.show(looking((x, 1.0, 2.0), (x, 2.01, 0.75)))
+    assert len(stage.registry.instances) == surfaces
+
+
 def test_a_wall_that_something_hides_in_part_is_one() -> None:
     pillar = Rectangle((0.0, 2.0, 1.25), (1, 0, 0), (0, 0, 1), (0.3, 2.5))
     _, ids = Stage([WALL, pillar, FLOOR]).show(HERE)
