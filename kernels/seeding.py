@@ -19,7 +19,7 @@ def plain_and_planar(
     plane_std: ti.f32,  # likewise for a cell on one plane, once a linear trend is taken off
     planar_rms: ti.f32,  # 1/m, residual of inverse depth below which a cell is flat
     on_planes_only: ti.i32,  # 1 = cells that are not on one plane do not count
-    cells: nd(ti.i32, ndim=2),  # [rows, columns] out: 0, PLAIN_AND_PLANAR, or ON_PLANE if it is all on one plane besides
+    cells: nd(ti.i32, ndim=2),  # [rows, columns] out: 0, PLAIN_AND_PLANAR or, if it is on one plane, ON_PLANE
 ):
     """Cells in which every pixel has depth, colours hardly vary and one plane explains the depth.
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from tgslam.errors import FrameError
 from tgslam.geometry import se3_exp
-from tgslam.types import Camera, Frame, FrameReport, FrameStatus, Gaussians, Matrix4, Rendering, Trajectory
+from tgslam.types import Camera, Frame, FrameReport, FrameStatus, Gaussians, Matrix4, Plane, Rendering, Trajectory
 
 CAMERA = Camera(24, 16, 20.0, 20.0, 11.5, 7.5)
 
@@ -38,6 +38,9 @@ class FakeSource:
             raise OSError(5, "Input/output error", "disk")
         shape = (CAMERA.height, CAMERA.width)
         return Frame(index, 0.1 * index, np.full((*shape, 3), 0.5, np.float32), np.full(shape, 2.0, np.float32))
+
+    def truth(self) -> None:
+        return None
 
     def groundtruth(self) -> Trajectory:
         self.groundtruth_asked = True
@@ -94,6 +97,25 @@ class FakeSystem:
             embedding=np.zeros((count, 3), np.float32),
             plane_id=np.full(count, -1, np.int32),
             birth_keyframe=np.arange(count, dtype=np.int32),
+        )
+
+    def planes(self) -> tuple[Plane, ...]:
+        """The wall that every frame shows."""
+        corners = np.array([[-1.0, -1.0, 2.0], [-1.0, 1.0, 2.0], [1.0, 1.0, 2.0], [1.0, -1.0, 2.0]])
+        colour, keyframes = (1.0, 0.5, 0.0), tuple(frame.index for frame in self.keyframes)
+        return (
+            Plane(
+                id=4,
+                normal_w=np.array([0.0, 0.0, -1.0]),
+                offset_m=2.0,
+                centroid_w=np.array([0.0, 0.0, 2.0]),
+                covariance=1e-6 * np.eye(3),
+                colour=colour,
+                polygons_w=(corners,),
+                area_m2=4.0,
+                inlier_rms_m=0.003,
+                keyframes=keyframes,
+            ),
         )
 
     def _trajectory(self, frames: list[Frame]) -> Trajectory:

@@ -74,7 +74,10 @@ def state_of(run: Path) -> str:
 
 def test_run_writes_the_whole_folder(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "--output", "out", "--set", "seed=3"]) == 0
-    names = "config.yaml keyframes.txt log.jsonl map.ply map_extra.npz metrics.json run.json trajectory.txt"
+    names = (
+        "config.yaml floorplan.svg keyframes.txt log.jsonl map.ply map_extra.npz map_planes.ply metrics.json "
+        "planes.glb planes.json run.json trajectory.txt"
+    )
     assert sorted(path.name for path in Path("out").iterdir()) == names.split()
     metrics = metrics_of(Path("out"))
     assert tuple(metrics) == METRIC_KEYS

@@ -22,7 +22,10 @@ from tgslam.output.run_folder import RunFolder
 from tgslam.output.trajectory_io import read_trajectory
 from tgslam.types import FrameReport, FrameStatus, Trajectory
 
-RESULTS = {"trajectory.txt", "keyframes.txt", "map.ply", "map_extra.npz", "log.jsonl"}
+RESULTS = {
+    *("trajectory.txt", "keyframes.txt", "map.ply", "map_extra.npz", "log.jsonl"),
+    *("planes.json", "planes.glb", "floorplan.svg", "map_planes.ply"),
+}
 
 
 @pytest.fixture
@@ -144,7 +147,9 @@ def test_two_runs_write_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
         folder = RunFolder.create(tmp_path / name, overwrite=False)
         pipeline.run(FakeSource(), FakeSystem(), folder)
-        contents.append([path.read_bytes() for path in (folder.trajectory, folder.keyframes, folder.map)])
+        files = (folder.trajectory, folder.keyframes, folder.map, folder.planes)
+        contents.append([path.read_bytes() for path in files])
+        contents[-1] += [path.read_bytes() for path in (folder.planes_mesh, folder.floorplan, folder.map_planes)]
     assert contents[0] == contents[1]
 
 
@@ -163,7 +168,10 @@ def test_metrics_of_a_run(folder: RunFolder) -> None:
     assert metrics["psnr_db"] == pytest.approx(20, abs=1e-4)
     assert metrics["psnr_masked_db"] == pytest.approx(20, abs=1e-4)
     assert metrics["depth_l1_cm"] == pytest.approx(1, abs=1e-4)
-    assert all(metrics[key] is None for key in ("planes", "closures", "lpips"))
+    assert metrics["planes"] == 1
+    assert metrics["plane_area_m2"] == pytest.approx(4)
+    assert metrics["plane_rms_mm"] == pytest.approx(3)
+    assert all(metrics[key] is None for key in ("closures", "lpips", "plane_pq", "plane_normal_deg", "floater_share"))
 
 
 def test_metrics_that_do_not_apply_are_null(folder: RunFolder) -> None:

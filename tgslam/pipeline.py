@@ -18,7 +18,7 @@ from tgslam.output.ply import write_map
 from tgslam.output.progress import FrameObserver
 from tgslam.output.run_folder import RunFolder
 from tgslam.output.trajectory_io import write_trajectory
-from tgslam.types import Frame, FrameReport, FrameStatus, Gaussians, Trajectory
+from tgslam.types import Frame, FrameReport, FrameStatus, Gaussians, Plane, Trajectory
 
 _log = logging.getLogger(__name__)
 _MAX_WARNINGS = 5  # skipped or lost frames that are named; log.jsonl has all
@@ -42,6 +42,9 @@ class System(Protocol):
     def gaussians(self) -> Gaussians:
         """The map."""
 
+    def planes(self) -> tuple[Plane, ...]:
+        """The persistent planes by id, empty when the system looks for none."""
+
 
 @dataclass(frozen=True)
 class Summary:
@@ -64,7 +67,7 @@ def run(
     observer: FrameObserver = lambda report: None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> Summary:
-    """Feed every frame to `system`, refine, and write trajectory.txt, keyframes.txt and map.ply; log.jsonl grows on.
+    """Feed every frame to `system`, refine, and write trajectories, planes and map.ply; log.jsonl grows on.
 
     read_ahead: decode the next frame in a thread meanwhile; only for a source that does not use the kernels itself.
     refine: call `finish`; never done after a request to stop.
@@ -81,7 +84,9 @@ def run(
             summary = replace(summary, finish_s=time.perf_counter() - start_s)
         write_trajectory(folder.trajectory, system.trajectory())
         write_trajectory(folder.keyframes, system.keyframe_trajectory())
-        write_map(folder.map, system.gaussians())
+        gaussians = system.gaussians()
+        folder.write_planes(system.planes(), gaussians)
+        write_map(folder.map, gaussians)
     except Exception:
         _save_partial(system, folder)
         raise

@@ -18,13 +18,12 @@ from tgslam.geometry import inverse, orthonormalized
 from tgslam.keyframes import KeyframeSelector
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.mapper import Mapper
-from tgslam.mapping.structure import Structure
 from tgslam.planes.cue import StructureCue
 from tgslam.tracking.exposure import Exposure
 from tgslam.tracking.motion import ConstantVelocity
 from tgslam.tracking.result import TrackingResult
 from tgslam.tracking.solver import make_tracker, track_or_recover
-from tgslam.types import Camera, Frame, FrameReport, FrameStatus, Gaussians, Trajectory
+from tgslam.types import Camera, Frame, FrameReport, FrameStatus, Gaussians, Plane, Trajectory
 
 _MIN_DEPTH_SHARE = 0.01  # a frame with depth in fewer of its pixels is not usable
 _FALLBACKS = 3  # latest keyframes from which a lost camera is sought
@@ -48,9 +47,10 @@ class Slam:
         self.motion = ConstantVelocity()
         self.selector = KeyframeSelector(config.keyframes)
         rng = np.random.default_rng(config.seed)
-        self.structure = Structure(camera, config.planes, self.sigma_per_m2) if config.planes.enabled else None
+        self.mapper = Mapper(
+            camera, config.mapping, config.seeding, config.loss, rng, config.planes, config.structure
+        )  # fmt: skip
         self.structure_cue = StructureCue(config.planes)
-        self.mapper = Mapper(camera, config.mapping, config.seeding, config.loss, rng, self.structure)
         self.exposure = Exposure()
         self._posed: list[_Posed] = []
         self._stage_s: dict[str, float] = {}
@@ -101,6 +101,10 @@ class Slam:
         """The map, on the host."""
         return self.mapper.gaussians.gaussians()
 
+    def planes(self) -> tuple[Plane, ...]:
+        """The persistent planes by id, empty when planes are not looked for."""
+        return ()
+
     def _track(self, frame: Frame) -> TrackingResult:
         predicted = self.motion.predict(frame.timestamp_s)
         latest = self._posed[-1]
@@ -122,8 +126,9 @@ class Slam:
         self._posed.append(_Posed(frame.timestamp_s, keyframe, np.eye(4)))
         self.tracker.rasterizer.forward(self.mapper.gaussians, keyframe.T_cw)
         self.selector.reset(frame, keyframe.T_cw, self.tracker.rasterizer.visible(self.mapper.gaussians.count))
-        if self.structure:
-            self.structure_cue.reset(self.structure.seen_from(len(self.mapper.keyframes) - 1), keyframe.T_cw)
+        if self.mapper.planes:
+            seen = self.mapper.planes.seen_from(len(self.mapper.keyframes) - 1)
+            self.structure_cue.reset(seen, keyframe.T_cw)
 
     def _remember(self, frame: Frame, T_cw: NDArray[np.float64]) -> None:
         keyframe = self.mapper.keyframes[-1]

@@ -78,6 +78,22 @@ class Gaussians:
 
 
 @dataclass(frozen=True)
+class Plane:
+    """A persistent plane of the world (a PGI): n . x + d = 0, n towards the side that it was seen from."""
+
+    id: int
+    normal_w: NDArray[np.float64]  # [3] unit
+    offset_m: float  # d
+    centroid_w: NDArray[np.float64]  # [3] m, on the plane, where it is known best
+    covariance: NDArray[np.float64]  # [3, 3] of (rad, rad, m): turns about its tangents, shift at the centroid
+    colour: tuple[float, float, float]  # RGB in [0, 1], of Eq. 2
+    polygons_w: tuple[NDArray[np.float64], ...]  # outlines [V, 3] m, largest first, counter-clockwise from the front
+    area_m2: float  # of everything seen of it
+    inlier_rms_m: float  # distance of its points from it
+    keyframes: tuple[int, ...]  # that saw it, ascending
+
+
+@dataclass(frozen=True)
 class Rendering:
     """What the map looks like from one pose, as host arrays."""
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.cuda.harness import GRIDS, Devices, assert_close
-from tests.cuda.scenarios import adam, images, projection, relaxation
+from tests.cuda.scenarios import adam, images, planes, projection, relaxation
 from tools.cudacheck.environment import Grid
 
 pytestmark = [pytest.mark.cuda_check, pytest.mark.parametrize("grid", GRIDS)]
@@ -31,6 +31,16 @@ def test_depth_images(devices: Devices, grid: Grid) -> None:
     cpu, cuda = devices.both(images.geometry, grid)
     assert_close(cuda, cpu, atol=2e-5)
     assert 0.3 < (cpu["normals"] != 0).any(axis=2).mean() < 1.0
+
+
+def test_planes(devices: Devices, grid: Grid) -> None:
+    cpu, cuda = devices.both(planes.extraction, grid)
+    assert len(cpu["normal"]) >= 3
+    assert (cuda["labels"] != cpu["labels"]).mean() < 1e-3
+    for name in ("normal", "offset_m"):
+        np.testing.assert_allclose(cuda[name], cpu[name], atol=1e-4, err_msg=name)
+    np.testing.assert_allclose(cuda["covariance"], cpu["covariance"], rtol=0.01, atol=1e-9)
+    np.testing.assert_array_equal(cuda["reliable"], cpu["reliable"])
 
 
 @pytest.mark.parametrize("with_embedding", [True, False])

@@ -116,6 +116,22 @@ def print_run(result: dict[str, Any]) -> None:
     print_columns(f"tgslam run {' '.join(result['arguments'])}".rstrip(), ("kernel cache", *CACHES), rows)
 
 
+def print_ablation(result: dict[str, Any]) -> None:
+    """Wrong pixels of each identity by iteration."""
+    print_machine(result["machine"])
+    curves = result["curves"]
+    rows = [
+        (str(iteration), *(f"{curve['wrong'][number]:.2%}" for curve in curves.values()))
+        for number, iteration in enumerate(result["iterations"])
+    ]
+    print_columns(
+        f"pixels whose plane is read wrongly, frame {result['frame']} of {_name(result)} with {result['planes']} "
+        f"planes, {result['gaussians']:,} Gaussians",
+        ("iterations", *(f"{identity} ids" for identity in curves)),
+        rows,
+    )
+
+
 def _rates(case: dict[str, Any]) -> tuple[str, ...]:
     slot_pairs = case["pairs"] + case["pairs_skipped"]
     row = [

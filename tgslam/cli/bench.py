@@ -1,4 +1,4 @@
-"""`tgslam bench`: how fast the rasterizer, tracking, mapping and whole runs are on this machine."""
+"""`tgslam bench`: how fast the rasterizer, tracking, mapping and whole runs are here; and comparisons of methods."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from tgslam.cli.inputs import open_frames, parse_frames, resolve_config
 from tgslam.cli.options import add_log_options
 from tgslam.errors import ConfigError, EvaluationError
 from tgslam.output.console import error_console
+from tgslam.output.images import write_colour
 from tgslam.output.progress import frame_progress, step_progress
 
 if TYPE_CHECKING:
@@ -32,10 +33,11 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = commands.add_parser(
         "bench",
         help="measure speed",
-        description="Time the rasterizer, a mapping iteration, a tracking step or a whole run, stage by stage.",
+        description="Time the rasterizer, a mapping iteration, a tracking step or a whole run, stage by stage; or "
+        "compare ways of learning which plane is where.",
     )
     benchmarks = parser.add_subparsers(metavar="BENCHMARK", required=True)
-    for add in (_add_render, _add_map, _add_track, _add_run):
+    for add in (_add_render, _add_map, _add_track, _add_run, _add_ablation):
         benchmark = add(benchmarks)
         benchmark.add_argument("--json", action="store_true", help="print everything as JSON instead of tables")
         add_log_options(benchmark, default=argparse.SUPPRESS)
@@ -51,7 +53,8 @@ def execute(args: argparse.Namespace) -> int:
     from tgslam.bench import report
 
     printers = {
-        "render": report.print_render, "map": report.print_map, "track": report.print_track, "run": report.print_run
+        "render": report.print_render, "map": report.print_map, "track": report.print_track, "run": report.print_run,
+        "ablation": report.print_ablation,
     }  # fmt: skip
     printers[result["benchmark"]](result)
     return 0
@@ -127,6 +130,22 @@ def _add_run(benchmarks: Any) -> argparse.ArgumentParser:
     )
     _add_sequence_options(parser, frames=None)
     parser.set_defaults(measure=_measure_run)
+    return parser
+
+
+def _add_ablation(benchmarks: Any) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = benchmarks.add_parser(
+        "ablation",
+        help="instance colours against scalar ids",
+        description="Learn the true planes of one frame of a built-in scene, as colours of a palette and as scalar "
+        "ids, and count the pixels that are read wrongly after 0 to 40 iterations.",
+    )
+    parser.add_argument("--scene", default="room", metavar="NAME", help="a built-in scene (default: room)")
+    parser.add_argument("--frame", type=_natural, default=0, metavar="N", help="of the scene (default: 0)")
+    parser.add_argument("--size", type=_size, default=_SIZE, metavar="WxH", help="of the image (default: 640x480)")
+    parser.add_argument("--output", type=Path, metavar="PNG", help="write what is read, and the truth, as a picture")
+    _add_thread_count(parser)
+    parser.set_defaults(measure=_measure_ablation)
     return parser
 
 
@@ -273,6 +292,30 @@ def _measure_run(args: argparse.Namespace) -> dict[str, Any]:
     return {"benchmark": "run", "machine": report.machine(), "arguments": arguments, "runs": runs}
 
 
+def _measure_ablation(args: argparse.Namespace) -> dict[str, Any]:
+    from tgslam.bench import ablation, report
+
+    threads = _start(args)
+    with step_progress("identity", len(ablation.IDENTITIES), error_console(), args.quiet) as step:
+        found = ablation.measure(args.scene, args.frame, args.size, step)
+    if args.output is not None:
+        write_colour(args.output, ablation.picture(found))
+    width, height = found.size
+    return {
+        "benchmark": "ablation",
+        "machine": report.machine(),
+        "threads": threads,
+        "scene": found.scene,
+        "frame": found.frame,
+        "width": width,
+        "height": height,
+        "planes": found.planes,
+        "gaussians": found.gaussians,
+        "iterations": list(ablation.ITERATIONS),
+        "curves": {curve.identity: {"wrong": curve.wrong, "loss": curve.loss} for curve in found.curves},
+    }
+
+
 def _start(args: argparse.Namespace) -> int:
     """Start the kernels and return the number of threads."""
     from tgslam.runtime import available_threads
@@ -306,6 +349,12 @@ def _size(text: str) -> tuple[int, int]:
     if not all(side.isdecimal() and _LEAST_PX <= int(side) <= _MOST_PX for side in (width, height)):
         raise argparse.ArgumentTypeError(f"{text!r} is not WIDTHxHEIGHT with sides of {_LEAST_PX} to {_MOST_PX} px")
     return int(width), int(height)
+
+
+def _natural(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 0 or more")
+    return int(text)
 
 
 def _positive(text: str) -> int:

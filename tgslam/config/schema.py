@@ -114,9 +114,9 @@ class SeedingConfig:
 
     smallest_cell_px: int = setting(2, 1, 64)  # cells at edges, texture and off planes
     cell_levels: int = setting(3, 1, 6)  # of the quadtree: the largest cell is 2^(levels - 1) times the smallest
-    plane_cell_levels: int = setting(5, 1, 8)  # likewise for cells on one plane (PGI)
+    plane_cell_levels: int = setting(4, 1, 8)  # likewise for cells on one plane (PGI)
     plain_colour_std: float = setting(0.015, 0.0, 1.0)  # a cell whose channels vary less has no texture
-    plane_colour_std: float = setting(0.02, 0.0, 1.0)  # likewise for a cell on one plane, but for a linear trend
+    plane_colour_std: float = setting(0.015, 0.0, 1.0)  # likewise for a cell on one plane, but for a linear trend
     planar_sigmas: float = setting(2.0, 0.0, 100.0)  # a cell whose plane residual is less, in sensor sigmas, is flat
     overlap: float = setting(0.6, 0.1, 3.0)  # standard deviation of a Gaussian in cell sizes
     thickness: float = setting(0.1, 1e-3, 1.0)  # standard deviation along the normal, relative to across
@@ -202,6 +202,29 @@ class PlanesConfig:
 
 
 @dataclass(frozen=True)
+class StructureConfig:
+    """What planes ask of the map: the instance field (Eqs. 1-4) and the regularisers (Eqs. 8, 9), as of Eq. 14."""
+
+    lambda_pgi: float = setting(0.1, 0.0, 100.0)  # what E_pgi weighs for geometry; 0 = no instance field
+    identity: str = setting("colour", choices=("colour", "scalar"))  # what a Gaussian carries of its plane's id
+    scalar_ids: int = setting(64, 1, 100_000)  # with identity: scalar, ids that can be told apart
+    pgi_interval: int = setting(3, 1, 1000)  # a keyframe's first refinement and every n-th one after see its planes
+    charbonnier_pgi: float = setting(0.1, 1e-6, 1.0)  # epsilon of Eq. 4, colour in [0, 1]
+    edge_boost: float = setting(2.0, 0.0, 100.0)  # pixels at a boundary weigh 1 + this
+    weight_none: float = setting(0.5, 0.0, 1.0)  # weight of measured pixels that are on no plane
+    relaxation: float = setting(1.0, 0.0, 1.9)  # of embeddings; 1 = the full step
+    read_margin: float = setting(0.05, 0.0, 1.0)  # ids are read where no other code is less than this farther
+    read_opacity: float = setting(0.5, 0.01, 1.0)  # and rendered opacity is at least this
+    lambda_str: float = setting(0.1, 0.0, 100.0)  # what E_str weighs; 0 = no regularisers
+    omega_flat: float = setting(1.0, 0.0, 100.0)  # of Eq. 8, scales relative to sqrt(s1 s2)
+    omega_normal: float = setting(1.0, 0.0, 100.0)  # of Eq. 9
+    omega_distance: float = setting(0.1, 0.0, 100.0)  # of the distance to the plane, in sigmas
+    thinness: float = setting(0.1, 0.0, 1.0)  # k of Eq. 8
+    sigma_distance_m: float = setting(0.01, 1e-5, 1.0)
+    charbonnier_distance_sigmas: float = setting(1.0, 1e-3, 100.0)  # epsilon of the distance
+
+
+@dataclass(frozen=True)
 class EvaluationConfig:
     """The fixed protocol: held-out frames never reach mapping, and keyframes are never held out."""
 
@@ -223,4 +246,5 @@ class Config:
     mapping: MappingConfig = dataclasses.field(default_factory=MappingConfig)
     planes: PlanesConfig = dataclasses.field(default_factory=PlanesConfig)
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
+    structure: StructureConfig = dataclasses.field(default_factory=StructureConfig)
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)

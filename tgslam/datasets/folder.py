@@ -9,6 +9,7 @@ from tgslam.datasets import images
 from tgslam.datasets.calibration import Calibration, check_size
 from tgslam.datasets.groundtruth import read_groundtruth
 from tgslam.datasets.lists import ImagePair
+from tgslam.datasets.truth import SceneTruth
 from tgslam.errors import DatasetError, FrameError
 from tgslam.types import Camera, Frame, Trajectory
 
@@ -82,6 +83,10 @@ class FolderSource:
     def groundtruth(self) -> Trajectory | None:
         """Camera-to-world poses from the ground truth file, or None without one. Raises DatasetError."""
         return None if self._groundtruth is None else read_groundtruth(self._groundtruth)
+
+    def truth(self) -> SceneTruth | None:
+        """None: nobody has labelled the surfaces of a recording."""
+        return None
 
     def _check_sizes(self, pair: ImagePair, colour: tuple[int, ...], depth: tuple[int, ...]) -> None:
         if colour != depth:

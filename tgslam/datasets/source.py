@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from tgslam.datasets.truth import SceneTruth, TruthOfFrames
 from tgslam.errors import ConfigError, DatasetError
 from tgslam.types import Camera, Frame, Trajectory
 
@@ -33,6 +34,9 @@ class RgbdSource(Protocol):
 
         Raises DatasetError when there is ground truth that cannot be read.
         """
+
+    def truth(self) -> SceneTruth | None:
+        """The true planes and surfaces of the scene, or None where nobody knows them."""
 
 
 class FrameRange:
@@ -80,6 +84,11 @@ class FrameRange:
     def groundtruth(self) -> Trajectory | None:
         """The whole ground truth of the source it was made from."""
         return self._source.groundtruth()
+
+    def truth(self) -> SceneTruth | None:
+        """The truth of the source it was made from, for the frames of the range."""
+        truth = self._source.truth()
+        return None if truth is None else TruthOfFrames(truth, self._indices)
 
 
 def parse_frame_slice(text: str) -> slice:

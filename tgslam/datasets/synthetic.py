@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.config.schema import SyntheticConfig
-from tgslam.synthetic import sensor
+from tgslam.datasets.truth import SceneTruth
+from tgslam.synthetic import sensor, surfaces
 from tgslam.synthetic.raycast import Raycaster, View
 from tgslam.synthetic.scenes import FRAME_RATE_HZ, scene_spec
 from tgslam.types import Camera, FloatImage, Frame, Matrix4, Trajectory
@@ -58,6 +59,18 @@ class SyntheticSource:
     def planes(self) -> NDArray[np.float64]:
         """World planes [P, 4]: unit normal out of the solid and offset in m, n . x + d = 0."""
         return self._scene.planes_w.copy()
+
+    def plane_areas_m2(self) -> NDArray[np.float64]:
+        """[P] of the faces on `planes`, what is hidden of them included."""
+        return surfaces.plane_areas_m2(self._scene)
+
+    def surface_distance_m(self, points_w: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[N] from points [N, 3] m to the nearest surface, exact; inside solids too it is positive."""
+        return surfaces.surface_distance_m(self._scene, points_w)
+
+    def truth(self) -> SceneTruth:
+        """The scene itself."""
+        return self
 
     def pose(self, index: int) -> Matrix4:
         """T_wc [4, 4] at the middle of the frame's exposure. Raises IndexError outside 0 .. len - 1."""

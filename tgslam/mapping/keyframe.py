@@ -25,6 +25,7 @@ class Keyframe:
     information: NDArray[np.float64]  # [6, 6] from tracking
     _colour: NDArray[np.uint8]
     _depth: NDArray[np.uint16]
+    plane_ids: NDArray[np.int16] | None = None  # [H, W] PGI of each pixel, -1 = none; None = planes are not looked for
 
     @classmethod
     def from_frame(

@@ -7,15 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam import images, runtime
-from tgslam.config.schema import LossConfig, MappingConfig, SeedingConfig
+from tgslam.config.schema import LossConfig, MappingConfig, PlanesConfig, SeedingConfig, StructureConfig
 from tgslam.depth import filled
 from tgslam.gaussian_map import GaussianMap
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, transform_points
 from tgslam.mapping.fusion import block_centre, depth_pyramid, fused_depth, sample, turned
 from tgslam.mapping.keyframe import Keyframe
+from tgslam.mapping.planar import PlanarMapping, PlanarPixels, projected
 from tgslam.mapping.refinement import Refiner
 from tgslam.mapping.seeding import cell_sizes, quadtree, seed
-from tgslam.mapping.structure import PlanarPixels, Structure, projected
 from tgslam.types import Camera
 
 _NEAR_M = 0.05
@@ -34,14 +34,16 @@ class Mapper:
         seeding: SeedingConfig,
         loss: LossConfig,
         rng: np.random.Generator,
-        structure: Structure | None = None,
+        planes: PlanesConfig | None = None,
+        structure: StructureConfig | None = None,
     ) -> None:
-        """structure: finds planes and makes use of them; None = the map knows nothing of planes."""
-        self.structure = structure
+        """planes, structure: how planes are found, and what they ask of the map; None = it knows nothing of planes."""
+        sigma_per_m2 = loss.depth_sigma_per_m2
+        self.planes = PlanarMapping(camera, planes, sigma_per_m2) if planes and planes.enabled else None
         self.camera, self.config, self.seeding, self.loss, self.rng = camera, mapping, seeding, loss, rng
         self.gaussians = GaussianMap()
         self.keyframes: list[Keyframe] = []
-        self.refiner = Refiner(camera, mapping, loss)
+        self.refiner = Refiner(camera, mapping, loss, structure=structure if self.planes else None)
         self.guessed = np.zeros(0, bool)  # [N] seeded where no depth was measured
         self.information = np.zeros(0)  # [N] 1/m^2, what is known of a Gaussian's depth
         self.support = np.zeros(0, np.int32)  # [N] keyframes whose depth agrees with the Gaussian
@@ -55,14 +57,14 @@ class Mapper:
         )
         self.conflict += surface.seen_through
         self.support += surface.supported
-        planes = self.structure.observe(keyframe, len(self.keyframes) - 1) if self.structure else None
+        planes = self._observe_planes(keyframe)
         kept = ~(self.guessed & surface.measured) & ~self._too_coarse(keyframe, surface, planes)
         self._keep(kept)
         self._fuse(keyframe, surface, kept)
         self._insert(keyframe, planes)
-        if self.structure and planes:
+        if self.planes and planes:
             rows, v, u = projected(self.gaussians, self.camera, keyframe.T_cw)
-            self.structure.label(self.gaussians, rows, planes.ids[v, u])
+            self.planes.label(self.gaussians, rows, planes.ids[v, u])
         for view in self._schedule(self.config.iterations):
             self.refiner.step(self.gaussians, view, move_pose=self._may_move(view))
         self._prune()
@@ -73,6 +75,15 @@ class Mapper:
             for k in self.rng.permutation(len(self.keyframes)):
                 self.refiner.step(self.gaussians, self.keyframes[k], move_pose=False)
         self._prune()
+
+    def _observe_planes(self, keyframe: Keyframe) -> PlanarPixels | None:
+        """The PGIs in the keyframe, which refinement hears of too."""
+        if not self.planes:
+            return None
+        pixels = self.planes.observe(keyframe, len(self.keyframes) - 1)
+        if self.refiner.structure:
+            self.refiner.structure.set_planes(*self.planes.table())
+        return pixels
 
     def _insert(self, keyframe: Keyframe, planes: PlanarPixels | None) -> None:
         """Seed Gaussians where the map is open; where no depth was measured, at a guessed one."""

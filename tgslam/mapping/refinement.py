@@ -1,4 +1,4 @@
-"""Refining the map and keyframe poses under the RGB-depth objective (Eqs. 12-14), one view at a time."""
+"""Refining the map and keyframe poses under the total objective (Eq. 14), one view at a time."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam import losses, runtime
-from tgslam.config.schema import LossConfig, MappingConfig
+from tgslam.config.schema import LossConfig, MappingConfig, StructureConfig
 from tgslam.gaussian_map import GaussianMap, MapGradient
 from tgslam.geometry import orthonormalized, se3_exp
+from tgslam.instance_field import InstanceGradient
 from tgslam.kernels import relaxation
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.sightings import Sightings
+from tgslam.mapping.structure import StructureTerms
 from tgslam.optim import Adam
 from tgslam.render import ImageGradient, Rasterizer
 from tgslam.stopwatch import Stopwatch, stage
@@ -24,13 +26,22 @@ _GEOMETRY = {"mean": 3, "log_scale": 3, "quat_wxyz": 4, "opacity_logit": 0}
 
 
 class Refiner:
-    """One view at a time: render, compare, step. Colours relax, the rest moves by Adam."""
+    """One view at a time: render, compare, step. Colours and embeddings relax, the rest moves by Adam."""
 
     def __init__(
-        self, camera: Camera, config: MappingConfig, loss: LossConfig, stopwatch: Stopwatch | None = None
+        self,
+        camera: Camera,
+        config: MappingConfig,
+        loss: LossConfig,
+        stopwatch: Stopwatch | None = None,
+        structure: StructureConfig | None = None,
     ) -> None:
-        """stopwatch: takes the seconds of the stages forward, loss, backward and update, for benchmarks."""
+        """stopwatch: takes the seconds of the stages forward, loss, backward and update, for benchmarks.
+
+        structure: of the terms that planes add (`set_planes`, `Keyframe.plane_ids`); None = planes play no part.
+        """
         self.config, self.loss, self.stopwatch = config, loss, stopwatch
+        self.structure = StructureTerms(camera, structure, config.window + config.window_random) if structure else None
         self.rasterizer = Rasterizer(camera)
         self.adam = _optimiser(config, camera)
         self._sightings = Sightings()
@@ -66,35 +77,47 @@ class Refiner:
         the host by itself.
         """
         observation = self._observation(keyframe)
+        target = self.structure.due(keyframe) if self.structure else None
         gain, bias = 1.0 / keyframe.exposure.gain, -keyframe.exposure.bias / keyframe.exposure.gain
         with stage(self.stopwatch, "forward"):
-            rendered = self.rasterizer.forward(gaussians, keyframe.T_cw)
+            rendered = self.rasterizer.forward(gaussians, keyframe.T_cw, with_embedding=target is not None)
         with stage(self.stopwatch, "loss"):
             loss = losses.rgbd_loss(
                 rendered.colour, rendered.depth, rendered.opacity, observation, self.loss, gain, bias,
                 workspace=self._workspace,
             )  # fmt: skip
+            pgi = self.structure.pgi(rendered, target, loss.g_opacity) if self.structure and target else None
         with stage(self.stopwatch, "backward"):
-            g_pose = self._backward(gaussians, loss)
+            g_pose = self._backward(gaussians, loss, pgi)
         with stage(self.stopwatch, "update"):
-            self._update_map(gaussians, loss)
+            self._update_map(gaussians, loss, pgi)
             if move_pose:
                 self._update_pose(keyframe, g_pose)
         return loss
 
-    def _backward(self, gaussians: GaussianMap, loss: losses.LossResult) -> NDArray[np.float64]:
-        """Fill the map's gradient; returns the pose's [6]."""
+    def _backward(
+        self, gaussians: GaussianMap, loss: losses.LossResult, pgi: InstanceGradient | None
+    ) -> NDArray[np.float64]:
+        """Fill the map's gradient; returns the pose's [6].
+
+        Nothing here moves by the curvature of depth, so that E_pgi's takes its place where there is one.
+        """
         if self._gradient.mean.shape[0] != gaussians.capacity:
             self._gradient = MapGradient.zeros(gaussians.capacity)
         else:
             self._gradient.clear()
         g = ImageGradient(
-            loss.g_colour, loss.g_depth, loss.g_opacity, colour_weight=loss.w_colour, depth_weight=loss.w_depth
-        )
+            loss.g_colour, loss.g_depth, loss.g_opacity, pgi.embedding if pgi else None,
+            colour_weight=loss.w_colour, depth_weight=pgi.weight if pgi else loss.w_depth,
+        )  # fmt: skip
         return self.rasterizer.backward(gaussians, g, self._gradient)
 
-    def _update_map(self, gaussians: GaussianMap, loss: losses.LossResult) -> None:
+    def _update_map(self, gaussians: GaussianMap, loss: losses.LossResult, pgi: InstanceGradient | None) -> None:
         gradient, visible = self._gradient, self.rasterizer.tile_count
+        if self.structure:
+            self.structure.regularise(gaussians, visible, gradient)
+            if pgi:
+                self.structure.move_embeddings(gaussians, visible, gradient, pgi.target)
         names = list(self.adam.learning_rates)
         self.adam.step(
             {name: getattr(gaussians, name) for name in names},

@@ -1,117 +1,83 @@
-"""Planes in mapping: what the Planar Gaussian Instances say of a keyframe's pixels and of the map's Gaussians."""
+"""What planes ask of the map in a refinement step: E_pgi (Eq. 4) and E_str (Eqs. 8, 9)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import OrderedDict
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam import runtime
-from tgslam.config.schema import PlanesConfig
-from tgslam.gaussian_map import GaussianMap
-from tgslam.geometry import transform_points
+from tgslam import instance_field, runtime
+from tgslam.config.schema import StructureConfig
+from tgslam.gaussian_map import GaussianMap, MapGradient
+from tgslam.instance_field import InstanceGradient, InstanceTarget
 from tgslam.mapping.keyframe import Keyframe
-from tgslam.planes.extraction import extract_planes
-from tgslam.planes.instance import NO_ID, PlanarInstance
-from tgslam.planes.registry import PlaneRegistry
+from tgslam.plane_regularisers import PlaneRegularisers
+from tgslam.planes.codes import code_table
+from tgslam.splatting.images import RenderImages
 from tgslam.types import Camera
 
-_CLOSING_PX = 7  # window in which a PGI may surround a pixel
-_CLOSING_SHARE = 0.6  # of its pixels that must be the PGI's
-_AGREEMENT = 5.0  # standard deviations of sensor and model between a PGI and a measurement that counts as its
 
+class StructureTerms:
+    """The terms with their scratch memory, and what they know of planes and keyframes."""
 
-@dataclass(frozen=True)
-class PlanarPixels:
-    """The PGIs in a keyframe's image."""
+    def __init__(self, camera: Camera, config: StructureConfig, kept_targets: int) -> None:
+        """kept_targets: keyframes whose prepared images are kept, the most recently used ones."""
+        self.config = config
+        self._kept_targets = kept_targets
+        self._workspace = instance_field.Workspace(camera.height, camera.width)
+        self._regularisers = PlaneRegularisers(config)
+        self._targets: OrderedDict[int, tuple[NDArray[np.int16], InstanceTarget]] = OrderedDict()
+        self._visits: dict[int, int] = {}  # by keyframe
+        self.set_planes(np.zeros((0, 4)), np.zeros(0, np.int32))
 
-    ids: NDArray[np.int32]  # [H, W] -1 = on no PGI
-    depth_m: NDArray[np.float32]  # [H, W] of the PGI along the pixel's ray; 0 where there is none
-    normals_c: NDArray[np.float32]  # [H, W, 3] of the PGI, towards the camera; 0 where there is none
+    def set_planes(self, planes_w: NDArray[np.floating], ids: NDArray[np.integer]) -> None:
+        """The planes as they are now; call it when one was added, refitted, merged or removed.
 
+        planes_w: [P, 4] unit normal and offset in m by plane id, world; a row of zeros is no plane. ids: [P] the id
+        under which each lives on after merges (mostly its own; its row of planes_w is then that one's), -1 = removed.
+        """
+        self._planes = runtime.to_device(planes_w)
+        self._codes = runtime.to_device(code_table(ids, self.config))
 
-class Structure:
-    """Finds planes in keyframes, keeps the PGIs, and ties Gaussians to them."""
+    def due(self, keyframe: Keyframe) -> InstanceTarget | None:
+        """The keyframe's target, if E_pgi takes part in this step: embeddings converge in few, so not in each."""
+        if keyframe.plane_ids is None or self.config.lambda_pgi == 0.0:
+            return None
+        visit = self._visits.get(keyframe.index, 0)
+        self._visits[keyframe.index] = visit + 1
+        return self._target(keyframe, keyframe.plane_ids) if visit % self.config.pgi_interval == 0 else None
 
-    def __init__(self, camera: Camera, config: PlanesConfig, sigma_per_m2: float) -> None:
-        """sigma_per_m2: the sensor's noise, sigma_z = this * z^2."""
-        self.camera, self.config, self.sigma_per_m2 = camera, config, sigma_per_m2
-        self.registry = PlaneRegistry(config, sigma_per_m2)
-        v, u = np.mgrid[: camera.height, : camera.width]
-        self._rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], -1)
+    def pgi(self, rendered: RenderImages, target: InstanceTarget, g_opacity: np.ndarray) -> InstanceGradient:
+        """E_pgi at a rendering; its derivative by opacity is added to g_opacity [H, W]."""
+        return instance_field.pgi_loss(
+            rendered.embedding, rendered.opacity, target, self._codes, self.config, g_opacity, self._workspace
+        )
+
+    def regularise(self, gaussians: GaussianMap, visible: np.ndarray, gradient: MapGradient) -> None:
+        """Add the gradient of E_str."""
+        if self.config.lambda_str > 0.0 and self._planes.shape[0]:
+            self._regularisers.add(gaussians, visible, self._planes, gradient)
+
+    def move_embeddings(
+        self, gaussians: GaussianMap, visible: np.ndarray, gradient: MapGradient, target: InstanceTarget
+    ) -> None:
+        """Relax the embeddings; the curvature's second column must hold the weights of E_pgi."""
+        instance_field.relax(
+            gaussians.count, visible, gradient.embedding, gradient.curvature, target, self.config, gaussians.embedding
+        )
 
     @property
-    def instances(self) -> dict[int, PlanarInstance]:
-        """The PGIs by id."""
-        return self.registry.instances
+    def parts(self) -> dict[str, float]:
+        """Means of E_str's terms in the last step that had it: flat, normal, distance; count of Gaussians."""
+        return self._regularisers.parts
 
-    def observe(self, keyframe: Keyframe, number: int) -> PlanarPixels:
-        """Match a keyframe's planes to the PGIs. number: of the keyframe, growing from call to call."""
-        depth_m = keyframe.depth_m()
-        view = extract_planes(runtime.to_device(depth_m), self.camera, self.config, self.sigma_per_m2)
-        observation = self.registry.observe(view, depth_m, self.camera, keyframe.T_cw, number)
-        return self._pixels(self._closed(observation.id_image(view.labels)), depth_m, keyframe.T_cw)
-
-    def seen_from(self, number: int) -> list[PlanarInstance]:
-        """The PGIs that a keyframe saw."""
-        return [self.instances[i] for i in self.registry.seen_from(number)]
-
-    def label(self, gaussians: GaussianMap, rows: NDArray[np.integer], ids: NDArray[np.int32]) -> None:
-        """Tie Gaussians [K] to the PGIs that a keyframe's pixels name, where they lie on them; -1 names none.
-
-        All other rows follow merges, and let go of PGIs that are no more.
-        """
-        plane_ids = gaussians.host("plane_id").copy()
-        for plane_id in np.unique(plane_ids[plane_ids >= 0]):
-            plane_ids[plane_ids == plane_id] = self.registry.resolve(int(plane_id))
-        means = gaussians.host("mean")
-        for plane_id, instance in self.instances.items():
-            named = rows[ids == plane_id]
-            distance = np.abs(means[named] @ instance.normal_w + instance.offset_m)
-            plane_ids[named[distance < self.config.max_distance_m]] = plane_id
-        gaussians.write("plane_id", slice(0, gaussians.count), plane_ids)
-
-    def _pixels(
-        self, ids: NDArray[np.int32], measured_m: NDArray[np.float32], T_cw: NDArray[np.float64]
-    ) -> PlanarPixels:
-        """Depth and normals of the PGIs, where they agree with the measurement."""
-        depth_m = np.zeros(ids.shape, np.float32)
-        normals_c = np.zeros((*ids.shape, 3), np.float32)
-        kept = np.full(ids.shape, NO_ID, np.int32)
-        for plane_id, instance in self.instances.items():
-            at = np.nonzero(ids == plane_id)
-            if not len(at[0]):
-                continue
-            normal = T_cw[:3, :3] @ instance.normal_w
-            offset_m = instance.offset_m - normal @ T_cw[:3, 3]
-            z = -offset_m / np.minimum(self._rays[at] @ normal, -1e-6)
-            sigma_m = self.sigma_per_m2 * z**2
-            agrees = np.abs(z - measured_m[at]) < _AGREEMENT * (sigma_m + self.config.model_sigma_m)
-            agrees |= measured_m[at] <= 0
-            on = at[0][agrees], at[1][agrees]
-            depth_m[on], normals_c[on], kept[on] = z[agrees], normal, plane_id
-        return PlanarPixels(kept, depth_m, normals_c)
-
-    def _closed(self, ids: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Pixels that one PGI surrounds belong to it: holes and outliers of the sensor."""
-        known = np.unique(ids[ids >= 0])
-        index = (np.searchsorted(known, ids) + 1).astype(np.uint8) * (ids >= 0).astype(np.uint8)
-        square = np.ones((_CLOSING_PX, _CLOSING_PX), np.uint8)
-        highest = cv2.dilate(index, square)
-        lowest = cv2.erode(np.where(index > 0, index, np.uint8(255)), square, borderValue=255)
-        share = cv2.blur((index > 0).astype(np.float32), square.shape)
-        fill = (index == 0) & (highest == lowest) & (share > _CLOSING_SHARE)
-        return np.where(fill, np.append(NO_ID, known)[highest], ids).astype(np.int32)
-
-
-def projected(
-    gaussians: GaussianMap, camera: Camera, T_cw: NDArray[np.float64]
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of the Gaussians whose centre lies in the image, and the pixels (v, u) it lies in."""
-    x = transform_points(T_cw, gaussians.host("mean"))
-    z = np.maximum(x[:, 2], 1e-3)
-    u, v = np.rint(camera.fx * x[:, 0] / z + camera.cx), np.rint(camera.fy * x[:, 1] / z + camera.cy)
-    rows = np.flatnonzero((x[:, 2] > 1e-3) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height))
-    return rows, v[rows].astype(np.intp), u[rows].astype(np.intp)
+    def _target(self, keyframe: Keyframe, plane_ids: NDArray[np.int16]) -> InstanceTarget:
+        known = self._targets.pop(keyframe.index, None)
+        if known is None or known[0] is not plane_ids:
+            depth_m = runtime.to_device(keyframe.depth_m())
+            known = plane_ids, instance_field.prepare(plane_ids, depth_m, self.config)
+        self._targets[keyframe.index] = known
+        while len(self._targets) > self._kept_targets:
+            self._targets.popitem(last=False)
+        return known[1]

@@ -52,6 +52,15 @@ def write_map(path: Path, gaussians: Gaussians) -> None:
             plane_id=gaussians.plane_id.astype("<i4"),
             birth_keyframe=gaussians.birth_keyframe.astype("<i4"),
         )
+    _write_rows(path, rows)
+
+
+def write_vertices(path: Path, gaussians: Gaussians) -> None:
+    """Write the PLY alone, without a sidecar, for viewers. Raises like `write_map`."""
+    _write_rows(path, _rows_of_gaussians(gaussians))
+
+
+def _write_rows(path: Path, rows: NDArray[np.float32]) -> None:
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     lines += [f"property float {name}" for name in ATTRIBUTES]
     lines += ["end_header", ""]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from enum import Enum
@@ -14,8 +15,13 @@ from tgslam.config.loader import dump, load
 from tgslam.config.schema import Config
 from tgslam.errors import OutputError
 from tgslam.output.atomic import write_text
+from tgslam.output.floorplan import write_floorplan
 from tgslam.output.log import plain
-from tgslam.types import Camera
+from tgslam.output.plane_colours import in_plane_colours
+from tgslam.output.planes_io import write_planes
+from tgslam.output.planes_mesh import write_mesh
+from tgslam.output.ply import write_vertices
+from tgslam.types import Camera, Gaussians, Plane
 
 
 class RunState(Enum):
@@ -49,6 +55,10 @@ class RunFolder:
         "keyframes.txt",
         "map.ply",
         "map_extra.npz",
+        "planes.json",
+        "planes.glb",
+        "floorplan.svg",
+        "map_planes.ply",
         "metrics.json",
         "log.jsonl",
         "config.yaml",
@@ -62,6 +72,10 @@ class RunFolder:
         self.trajectory = path / "trajectory.txt"
         self.keyframes = path / "keyframes.txt"
         self.map = path / "map.ply"
+        self.planes = path / "planes.json"
+        self.planes_mesh = path / "planes.glb"
+        self.floorplan = path / "floorplan.svg"
+        self.map_planes = path / "map_planes.ply"
         self.metrics = path / "metrics.json"
         self.log = path / "log.jsonl"
         self.config = path / "config.yaml"
@@ -131,6 +145,18 @@ class RunFolder:
     def read_metrics(self) -> dict[str, Any]:
         """The metrics of the run, empty when it never wrote any. Raises OutputError when they are damaged."""
         return _read_object(self.metrics) if self.metrics.exists() else {}
+
+    def write_planes(self, planes: Sequence[Plane], gaussians: Gaussians) -> None:
+        """Write planes.json and, if there are planes, what shows them: mesh, floor plan, and the map in their colours.
+
+        Raises OutputError for values that are not finite, and OSError.
+        """
+        write_planes(self.planes, planes)
+        if planes:
+            write_floorplan(self.floorplan, planes)
+            write_vertices(self.map_planes, in_plane_colours(gaussians, planes))
+        if any(plane.polygons_w for plane in planes):
+            write_mesh(self.planes_mesh, planes)
 
 
 def fresh_folder(parent: Path, name: str, now: datetime) -> Path:

@@ -25,6 +25,8 @@ WELL = 0.5  # of the gate: planes agree well
 _CAREFUL_IOU = 0.15  # of masks that are matched one to one; less is for pieces, which `continued` is for
 _LENIENT_IOU = 0.5  # likewise without care
 _GAP_RATIO = 2.0  # the longest gap in sizes of the smaller surface
+_GAP_SLACK_CELLS = 2.0  # wider than at its narrowest place, a gap is not looked at
+_GAP_PLACES = 12  # at which a gap is looked at
 _SHARED_VIEWS = 5  # latest ones in which two instances are compared
 _DEFERRED_VARIANCE = 4.0  # factor by which an ambiguous segment is less certain than it says
 
@@ -178,20 +180,21 @@ def adjoins(beside: NDArray[np.bool_]) -> bool:
 
 
 def shortest_gap(support: Support, cells: Cells, longest_m: float) -> tuple[Vector, Vector] | None:
-    """The nearest two places [3] m of cells [N, 2] and of the extent on whose grid they are.
+    """Places [K, 3] m of cells [N, 2], and those [K, 3] of the extent on whose grid they are, between which the gap is
+    narrowest: a few, from all along it.
 
-    None where they are farther apart than longest_m, or than twice the size of the smaller of the two.
+    None where it is wider than longest_m, or than twice the size of the smaller of the two.
     """
     occupied, _ = support.cells()
     if len(occupied) == 0 or len(cells) == 0:
         return None
     distance, nearest = cKDTree(occupied).query(cells)
-    closest = int(np.argmin(distance))
-    limit = min(longest_m / support.cell_m, _GAP_RATIO * np.sqrt(min(len(occupied), len(cells))))
-    if distance[closest] > limit:
+    least = float(distance.min())
+    if least > min(longest_m / support.cell_m, _GAP_RATIO * np.sqrt(min(len(occupied), len(cells)))):
         return None
-    start, end = support.centres(np.stack([cells[closest], occupied[nearest[closest]]]))
-    return start, end
+    narrow = np.flatnonzero(distance <= least + _GAP_SLACK_CELLS)
+    chosen = narrow[np.linspace(0, len(narrow) - 1, min(len(narrow), _GAP_PLACES)).astype(int)]
+    return support.centres(cells[chosen]), support.centres(occupied[nearest[chosen]])
 
 
 def coplanar_in_views(a: PlanarInstance, b: PlanarInstance) -> float | None:

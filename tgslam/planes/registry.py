@@ -60,6 +60,11 @@ class PlaneRegistry:
         return {i.id: i for i in sorted(self._instances, key=lambda instance: instance.id) if i.id != NO_ID}
 
     @property
+    def id_count(self) -> int:
+        """How many ids have been given."""
+        return self._next_id
+
+    @property
     def candidate_count(self) -> int:
         """Ambiguous surfaces that wait for further views."""
         return sum(instance.id == NO_ID for instance in self._instances)
@@ -213,9 +218,10 @@ class PlaneRegistry:
         return sigmas <= self._config.gate_sigmas and float(np.mean(large.support.holds(cells))) > _MOST
 
     def _joined(self, a: PlanarInstance, b: PlanarInstance, samples: Samples | None) -> bool:
-        """Whether two coplanar instances adjoin, or are large surfaces with a gap that no view has looked through.
+        """Whether two coplanar instances adjoin, or have a gap that is hidden or, between large surfaces, out of view.
 
-        Floors, walls and ceilings go on behind things and where no view has looked; table tops are smaller.
+        Floors, walls and ceilings go on behind things and where no view has looked; table tops are smaller. A gap that
+        any view has looked through parts two instances for good.
         """
         large, cells = _on_larger(a, b)
         if adjoins(large.support.near(cells, self._config.max_gap_m)):
@@ -225,11 +231,11 @@ class PlaneRegistry:
         gap = shortest_gap(large.support, cells, self._config.bridge_m)
         if gap is None:
             return False
-        seen_through, _ = gap_between(samples, *gap, large.plane, self._tolerance)
+        seen_through, in_image = gap_between(samples, *gap, large.plane, self._tolerance)
         if seen_through:
             self._apart.add(frozenset((a, b)))
             return False
-        return min(a.area_m2, b.area_m2) >= self._config.bridge_area_m2
+        return in_image or min(a.area_m2, b.area_m2) >= self._config.bridge_area_m2
 
     def _name(self, instance: PlanarInstance) -> int:
         instance.id = self._next_id

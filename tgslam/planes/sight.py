@@ -17,6 +17,7 @@ Vector = NDArray[np.float64]
 
 _NEAREST_M = 0.05  # places nearer to the camera's plane than this are not projected
 _GRAZING_COSINE = 0.05  # rays flatter than this say nothing of where they meet a plane
+_LEAST_THROUGH, _THROUGH_SHARE = 3, 0.1  # of the places in a gap: fewer are noise
 _STEP_M = 0.02  # between the places at which a gap is looked at
 _MAX_FOOTPRINT_CELLS = 1 << 20  # a degenerate segment does not make the grid explode
 
@@ -143,19 +144,22 @@ def may_appear(samples: Samples, planes: PlaneEstimate, corners_w: Vector) -> ND
 
 
 def gap_between(
-    samples: Samples, start_w: Vector, end_w: Vector, plane: PlaneEstimate, tolerance: Tolerance
+    samples: Samples, starts_w: Vector, ends_w: Vector, plane: PlaneEstimate, tolerance: Tolerance
 ) -> tuple[bool, bool]:
-    """The straight way between two places [3] m of a plane: is it seen through anywhere, is it all in the image?
+    """Straight ways [K, 3] to [K, 3] m in a plane: is any of them seen through, are all of them in the image?
 
-    Where it is not seen through, the plane may go on behind something else.
+    Where they are not seen through, the plane may go on behind something else.
     """
-    steps = max(int(np.linalg.norm(end_w - start_w) / _STEP_M), 3)
-    share = np.linspace(0.0, 1.0, steps + 2)[1:-1, None]
-    u, v, _, inside = samples.pixels(start_w + share * (end_w - start_w))
-    u, v = u[inside], v[inside]
-    z = samples.depth_m[v, u].astype(np.float64)
+    longest_m = float(np.linalg.norm(ends_w - starts_w, axis=1).max())
+    steps = max(int(longest_m / _STEP_M), 3)
+    share = np.linspace(0.0, 1.0, steps + 2)[1:-1, None, None]
+    places = starts_w + share * (ends_w - starts_w)  # [steps, K, 3]
+    u, v, _, inside = samples.pixels(places.reshape(-1, 3))
+    z = np.where(inside, samples.depth_m[v, u], 0.0).astype(np.float64)
     camera = samples.camera
     points = np.column_stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z])
     height = plane.heights_m(transform_points(inverse(samples.T_cw), points))
     limit = tolerance.sigmas * np.hypot(tolerance.sensor_per_m2 * z**2, tolerance.pose_m)
-    return bool(np.any((z > 0) & (height < -limit))), bool(inside.all())
+    through = ((z > 0) & (height < -limit)).reshape(steps, -1).sum(axis=0)
+    seen = inside.reshape(steps, -1).sum(axis=0)
+    return bool(np.any(through >= np.maximum(_LEAST_THROUGH, _THROUGH_SHARE * seen))), bool(inside.all())

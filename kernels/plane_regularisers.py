@@ -1,0 +1,169 @@
+"""What keeps the Gaussians of a plane flat, aligned and on it: Eqs. 8 and 9 and the distance, each a mean over them.
+
+A Gaussian is planar if its plane has a row in the table with a normal, and it takes part if it is visible. Both
+kernels go over blocks of Gaussians, a block a thread on the CPU and a warp under CUDA.
+"""
+
+import taichi as ti
+
+from tgslam.kernels.cuda.warp import WARP, warp_sum
+from tgslam.kernels.objective import charbonnier_root, share
+from tgslam.kernels.projection import quat_gradient, rotation_from_quat
+
+F1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
+F2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
+I1 = ti.types.ndarray(dtype=ti.i32, ndim=1)
+vec4 = ti.types.vector(4, ti.f32)
+
+BLOCK = WARP
+COUNT, FLAT, NORMAL, DISTANCE = range(4)  # sums over the planar Gaussians in sight
+TOTALS = 4
+
+
+@ti.func
+def is_planar(i, count, visible: ti.template(), plane_id: ti.template(), plane: ti.template()):
+    """1 if Gaussian i exists, is visible and lies on a plane, else 0."""
+    planar = 0
+    if i < count:
+        at = plane_id[i]
+        if visible[i] != 0 and at >= 0 and at < plane.shape[0]:
+            planar = ti.cast(plane[at, 0] != 0.0 or plane[at, 1] != 0.0 or plane[at, 2] != 0.0, ti.i32)
+    return planar
+
+
+@ti.func
+def regularise_one(
+    i,
+    plane_id: ti.template(),
+    plane: ti.template(),
+    mean: ti.template(),
+    log_scale: ti.template(),
+    quat: ti.template(),
+    weights,
+    thinness,
+    per_sigma,
+    epsilon,
+    grad_mean: ti.template(),
+    grad_log_scale: ti.template(),
+    grad_quat: ti.template(),
+):
+    """Add one Gaussian's gradients; returns its three penalties. weights: of the three, already over the count."""
+    at = plane_id[i]
+    normal = ti.Vector([plane[at, 0], plane[at, 1], plane[at, 2]])
+    # Flatness: scales relative to the middle one stay in range whatever the size
+    logs = ti.Vector([log_scale[i, 0], log_scale[i, 1], log_scale[i, 2]])
+    minor = ti.select(logs[1] < logs[0], 1, 0)
+    minor = ti.select(logs[2] < ti.min(logs[0], logs[1]), 2, minor)
+    least = ti.min(logs[0], ti.min(logs[1], logs[2]))
+    ratio = ti.exp(1.5 * least - 0.5 * logs.sum())  # s3 / sqrt(s1 s2)
+    off = ratio - thinness
+    # Alignment
+    raw = ti.Vector([quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3]])
+    inv_norm = 1.0 / raw.norm()
+    q = raw * inv_norm
+    R = rotation_from_quat(q[0], q[1], q[2], q[3])
+    axis = ti.Vector([0.0, 0.0, 0.0])
+    for k in ti.static(range(3)):
+        axis += ti.select(minor == k, 1.0, 0.0) * ti.Vector([R[0, k], R[1, k], R[2, k]])
+    cosine = axis.dot(normal)
+    towards = -weights[1] * ti.select(cosine < 0.0, -1.0, 1.0) * normal
+    H = R * 0.0
+    for k in ti.static(range(3)):
+        here = ti.select(minor == k, 1.0, 0.0)
+        grad_log_scale[i, k] = grad_log_scale[i, k] + weights[0] * off * ti.select(minor == k, 2.0 * ratio, -thinness)
+        for r in ti.static(range(3)):
+            H[r, k] = here * towards[r]
+    by_q = quat_gradient(H, q)
+    by_q = (by_q - q * by_q.dot(q)) * inv_norm
+    for c in ti.static(range(4)):
+        grad_quat[i, c] = grad_quat[i, c] + by_q[c]
+    # Distance
+    height = per_sigma * (normal.dot(ti.Vector([mean[i, 0], mean[i, 1], mean[i, 2]])) + plane[at, 3])
+    root = charbonnier_root(height * height, epsilon)
+    by_height = weights[2] * per_sigma * height / root
+    for c in ti.static(range(3)):
+        grad_mean[i, c] = grad_mean[i, c] + by_height * normal[c]
+    return vec4(0.0, off * off, 1.0 - ti.abs(cosine), root - epsilon)
+
+
+@ti.kernel
+def count_planar(
+    count: ti.i32,
+    visible: I1,  # [N] 0 = not in sight
+    plane_id: I1,  # [N] row of `plane`; none where there is no such row
+    plane: F2,  # [P, 4] unit normal and offset in m of n . x + d = 0, world; all 0 = no plane
+    partial: F2,  # [TOTALS, blocks] out
+):
+    """How many Gaussians take part."""
+    if ti.static(ti.cfg.arch == ti.cuda):
+        for i in range(partial.shape[1] * BLOCK):
+            total = warp_sum(ti.cast(is_planar(i, count, visible, plane_id, plane), ti.f32))
+            if i % WARP == 0:
+                partial[COUNT, i // WARP] = total
+                for c in ti.static(range(1, TOTALS)):
+                    partial[c, i // WARP] = 0.0
+    else:
+        for block in range(partial.shape[1]):
+            total = 0.0
+            for i in range(block * BLOCK, (block + 1) * BLOCK):
+                total += ti.cast(is_planar(i, count, visible, plane_id, plane), ti.f32)
+            partial[COUNT, block] = total
+            for c in ti.static(range(1, TOTALS)):
+                partial[c, block] = 0.0
+
+
+@ti.kernel
+def regularise(
+    count: ti.i32,
+    visible: I1,  # [N] 0 = not in sight
+    plane_id: I1,  # [N]
+    plane: F2,  # [P, 4]
+    mean: F2,  # [N, 3] m, world
+    log_scale: F2,  # [N, 3] log m
+    quat: F2,  # [N, 4] wxyz
+    weight_flat: ti.f32,
+    weight_normal: ti.f32,
+    weight_distance: ti.f32,
+    thinness: ti.f32,  # k of Eq. 8
+    sigma_m: ti.f32,  # unit of the distance
+    epsilon: ti.f32,  # Charbonnier, in sigmas
+    counted: F1,  # [TOTALS] of which COUNT is read
+    grad_mean: F2,  # [N, 3] added to, as are the next two
+    grad_log_scale: F2,  # [N, 3]
+    grad_quat: F2,  # [N, 4]
+    partial: F2,  # [TOTALS, blocks] out: the count again, and the sums of the three penalties
+):
+    """Penalties and gradients.
+
+    Eq. 8 is divided by s1 s2, which counts as a constant: its gradient by the logarithm of a scale would otherwise grow
+    with the square of the Gaussian's size, and it would flatten nothing but the largest ones.
+    """
+    if ti.static(ti.cfg.arch == ti.cuda):
+        for i in range(partial.shape[1] * BLOCK):
+            part = vec4(0.0)
+            if is_planar(i, count, visible, plane_id, plane) != 0:
+                each = share(1.0, counted[COUNT])
+                part = regularise_one(
+                    i, plane_id, plane, mean, log_scale, quat,
+                    each * ti.Vector([weight_flat, weight_normal, weight_distance]), thinness, 1.0 / sigma_m, epsilon,
+                    grad_mean, grad_log_scale, grad_quat,
+                )  # fmt: skip
+                part[COUNT] = 1.0
+            for c in ti.static(range(TOTALS)):
+                total = warp_sum(part[c])
+                if i % WARP == 0:
+                    partial[c, i // WARP] = total
+    else:
+        for block in range(partial.shape[1]):
+            total = vec4(0.0)
+            for i in range(block * BLOCK, (block + 1) * BLOCK):
+                if is_planar(i, count, visible, plane_id, plane) != 0:
+                    each = share(1.0, counted[COUNT])
+                    total += regularise_one(
+                        i, plane_id, plane, mean, log_scale, quat,
+                        each * ti.Vector([weight_flat, weight_normal, weight_distance]), thinness, 1.0 / sigma_m,
+                        epsilon, grad_mean, grad_log_scale, grad_quat,
+                    )  # fmt: skip
+                    total[COUNT] += 1.0
+            for c in ti.static(range(TOTALS)):
+                partial[c, block] = total[c]

@@ -1,0 +1,118 @@
+"""How well predicted instances are the true ones, counted in pixels of id images over one frame or a whole sequence.
+
+A true instance is one label, a predicted one is one id; negative values are neither. Labels that are not `counted` are
+void: whatever is predicted on their pixels is neither right nor wrong.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tgslam.errors import EvaluationError
+
+IdImage = NDArray[np.int32]
+Overlaps = Mapping[tuple[int, int], int]  # (true label, predicted id) -> pixels
+
+_MATCH_IOU = 0.5  # above it at most one prediction fits a label, and one label a prediction
+_VISIBLE_SHARE = 0.002  # of the image that a label covers: less of it says nothing about who it is
+_IDENTITY_SHARE = 0.25  # of a label's pixels that an id covers: less is no identity
+
+
+@dataclass(frozen=True)
+class PanopticScore:
+    """Panoptic quality and its parts; None where there is nothing to divide by."""
+
+    quality: float | None  # sum of the matches' IoU / (TP + FP / 2 + FN / 2)
+    mean_iou: float | None  # of the matches
+    precision: float | None  # share of the predicted instances that match
+    recall: float | None  # share of the true instances that match
+    matches: dict[int, int]  # true label -> predicted id
+
+
+def overlaps(labels: IdImage, ids: IdImage) -> Counter[tuple[int, int]]:
+    """Pixels by pair of true label and predicted id, for images [H, W]. Raises EvaluationError for unequal sizes."""
+    if labels.shape != ids.shape:
+        raise EvaluationError(f"the id image is {ids.shape}, but the labels are {labels.shape}")
+    pairs, pixels = np.unique(np.stack([labels.ravel(), ids.ravel()]), axis=1, return_counts=True)
+    return Counter({(int(label), int(id_)): int(n) for label, id_, n in zip(*pairs, pixels, strict=True)})
+
+
+def panoptic(pixels: Overlaps, counted: Collection[int]) -> PanopticScore:
+    """The score of one frame, or of the sum of several: then an instance is all its pixels of all frames.
+
+    A prediction that lies for more than half on void is no false one.
+    """
+    true_px: Counter[int] = Counter()
+    predicted_px: Counter[int] = Counter()
+    void_px: Counter[int] = Counter()
+    for (label, id_), count in pixels.items():
+        if label >= 0 and label not in counted:
+            void_px[id_] += count
+            continue
+        true_px[label] += count
+        predicted_px[id_] += count
+    true = {label for label in true_px if label >= 0}
+    ious = {
+        (label, id_): count / (true_px[label] + predicted_px[id_] - count)
+        for (label, id_), count in pixels.items()
+        if label in true and id_ >= 0
+    }
+    matched = {pair: iou for pair, iou in ious.items() if iou > _MATCH_IOU}
+    judged = {id_ for id_ in predicted_px if id_ >= 0 and predicted_px[id_] >= void_px[id_]}
+    judged |= {id_ for _, id_ in matched}
+    total = float(sum(matched.values()))
+    return PanopticScore(
+        quality=_ratio(2.0 * total, len(true) + len(judged)),
+        mean_iou=_ratio(total, len(matched)),
+        precision=_ratio(len(matched), len(judged)),
+        recall=_ratio(len(matched), len(true)),
+        matches=dict(sorted(matched)),
+    )
+
+
+class IdentitySwitches:
+    """Counts how often true instances change their predicted id from one frame that shows them to the next.
+
+    The id of a true instance in a frame is the one that covers most of it, if it is enough to speak of. Changing there
+    and back are two switches; of an instance that is split, each change of the larger part is one.
+    """
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self.switches = 0
+        self._latest: dict[int, int] = {}
+
+    def add(self, pixels: Overlaps, counted: Collection[int]) -> None:
+        """Take the overlaps of the next frame."""
+        self.frames += 1
+        size = sum(pixels.values())
+        for label in {label for label, _ in pixels if label in counted}:
+            found = {id_: count for (other, id_), count in pixels.items() if other == label}
+            identity = _identity(found, size)
+            if identity is not None:
+                self.switches += self._latest.get(label, identity) != identity
+                self._latest[label] = identity
+
+    @property
+    def per_100_frames(self) -> float | None:
+        """None before the first frame."""
+        return _ratio(100.0 * self.switches, self.frames)
+
+
+def _identity(pixels: Mapping[int, int], image_px: int) -> int | None:
+    """The id of a label that shows these pixels by predicted id; of equals, the smaller one."""
+    shown = sum(pixels.values())
+    known = {id_: count for id_, count in pixels.items() if id_ >= 0}
+    if not known or shown < _VISIBLE_SHARE * image_px:
+        return None
+    best = min(known, key=lambda id_: (-known[id_], id_))
+    return best if known[best] >= _IDENTITY_SHARE * shown else None
+
+
+def _ratio(part: float, whole: float) -> float | None:
+    return part / whole if whole else None

@@ -1,0 +1,128 @@
+"""Planes in mapping: what the Planar Gaussian Instances say of a keyframe's pixels and of the map's Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tgslam import runtime
+from tgslam.config.schema import PlanesConfig
+from tgslam.gaussian_map import GaussianMap
+from tgslam.geometry import transform_points
+from tgslam.mapping.keyframe import Keyframe
+from tgslam.planes.extraction import extract_planes
+from tgslam.planes.instance import NO_ID, PlanarInstance
+from tgslam.planes.registry import PlaneRegistry
+from tgslam.types import Camera
+
+_CLOSING_PX = 7  # window in which a PGI may surround a pixel
+_CLOSING_SHARE = 0.6  # of its pixels that must be the PGI's
+_AGREEMENT = 5.0  # standard deviations of sensor and model between a PGI and a measurement that counts as its
+
+
+@dataclass(frozen=True)
+class PlanarPixels:
+    """The PGIs in a keyframe's image."""
+
+    ids: NDArray[np.int32]  # [H, W] -1 = on no PGI
+    depth_m: NDArray[np.float32]  # [H, W] of the PGI along the pixel's ray; 0 where there is none
+    normals_c: NDArray[np.float32]  # [H, W, 3] of the PGI, towards the camera; 0 where there is none
+
+
+class PlanarMapping:
+    """Finds planes in keyframes, keeps the PGIs, and ties Gaussians to them."""
+
+    def __init__(self, camera: Camera, config: PlanesConfig, sigma_per_m2: float) -> None:
+        """sigma_per_m2: the sensor's noise, sigma_z = this * z^2."""
+        self.camera, self.config, self.sigma_per_m2 = camera, config, sigma_per_m2
+        self.registry = PlaneRegistry(config, sigma_per_m2)
+        v, u = np.mgrid[: camera.height, : camera.width]
+        self._rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], -1)
+
+    @property
+    def instances(self) -> dict[int, PlanarInstance]:
+        """The PGIs by id."""
+        return self.registry.instances
+
+    def observe(self, keyframe: Keyframe, number: int) -> PlanarPixels:
+        """Match a keyframe's planes to the PGIs. number: of the keyframe, growing from call to call."""
+        depth_m = keyframe.depth_m()
+        view = extract_planes(runtime.to_device(depth_m), self.camera, self.config, self.sigma_per_m2)
+        observation = self.registry.observe(view, depth_m, self.camera, keyframe.T_cw, number)
+        pixels = self._pixels(self._closed(observation.id_image(view.labels)), depth_m, keyframe.T_cw)
+        keyframe.plane_ids = pixels.ids.astype(np.int16)
+        return pixels
+
+    def table(self) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+        """By plane id: the plane [P, 4] as unit normal and offset in m, world, and the id [P] under which it lives on.
+
+        The row of a plane that was removed is zeros and -1.
+        """
+        ids = np.array([self.registry.resolve(i) for i in range(self.registry.id_count)], np.int32)
+        planes = np.zeros((len(ids), 4))
+        for plane_id, instance in self.instances.items():
+            planes[ids == plane_id] = *instance.normal_w, instance.offset_m
+        return planes, ids
+
+    def seen_from(self, number: int) -> list[PlanarInstance]:
+        """The PGIs that a keyframe saw."""
+        return [self.instances[i] for i in self.registry.seen_from(number)]
+
+    def label(self, gaussians: GaussianMap, rows: NDArray[np.integer], ids: NDArray[np.int32]) -> None:
+        """Tie Gaussians [K] to the PGIs that a keyframe's pixels name, where they lie on them; -1 names none.
+
+        All other rows follow merges, and let go of PGIs that are no more.
+        """
+        plane_ids = np.append(self.table()[1], np.int32(NO_ID))[gaussians.host("plane_id")]  # -1 takes the last one
+        means = gaussians.host("mean")
+        for plane_id, instance in self.instances.items():
+            named = rows[ids == plane_id]
+            distance = np.abs(means[named] @ instance.normal_w + instance.offset_m)
+            plane_ids[named[distance < self.config.max_distance_m]] = plane_id
+        gaussians.write("plane_id", slice(0, gaussians.count), plane_ids)
+
+    def _pixels(
+        self, ids: NDArray[np.int32], measured_m: NDArray[np.float32], T_cw: NDArray[np.float64]
+    ) -> PlanarPixels:
+        """Depth and normals of the PGIs, where they agree with the measurement."""
+        depth_m = np.zeros(ids.shape, np.float32)
+        normals_c = np.zeros((*ids.shape, 3), np.float32)
+        kept = np.full(ids.shape, NO_ID, np.int32)
+        for plane_id, instance in self.instances.items():
+            at = np.nonzero(ids == plane_id)
+            if not len(at[0]):
+                continue
+            normal = T_cw[:3, :3] @ instance.normal_w
+            offset_m = instance.offset_m - normal @ T_cw[:3, 3]
+            z = -offset_m / np.minimum(self._rays[at] @ normal, -1e-6)
+            sigma_m = self.sigma_per_m2 * z**2
+            agrees = np.abs(z - measured_m[at]) < _AGREEMENT * (sigma_m + self.config.model_sigma_m)
+            agrees |= measured_m[at] <= 0
+            on = at[0][agrees], at[1][agrees]
+            depth_m[on], normals_c[on], kept[on] = z[agrees], normal, plane_id
+        return PlanarPixels(kept, depth_m, normals_c)
+
+    def _closed(self, ids: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Pixels that one PGI surrounds belong to it: holes and outliers of the sensor."""
+        known = np.unique(ids[ids >= 0])
+        index = (np.searchsorted(known, ids) + 1).astype(np.uint8) * (ids >= 0).astype(np.uint8)
+        square = np.ones((_CLOSING_PX, _CLOSING_PX), np.uint8)
+        highest = cv2.dilate(index, square)
+        lowest = cv2.erode(np.where(index > 0, index, np.uint8(255)), square, borderValue=255)
+        share = cv2.blur((index > 0).astype(np.float32), square.shape)
+        fill = (index == 0) & (highest == lowest) & (share > _CLOSING_SHARE)
+        return np.where(fill, np.append(NO_ID, known)[highest], ids).astype(np.int32)
+
+
+def projected(
+    gaussians: GaussianMap, camera: Camera, T_cw: NDArray[np.float64]
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of the Gaussians whose centre lies in the image, and the pixels (v, u) it lies in."""
+    x = transform_points(T_cw, gaussians.host("mean"))
+    z = np.maximum(x[:, 2], 1e-3)
+    u, v = np.rint(camera.fx * x[:, 0] / z + camera.cx), np.rint(camera.fy * x[:, 1] / z + camera.cy)
+    rows = np.flatnonzero((x[:, 2] > 1e-3) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height))
+    return rows, v[rows].astype(np.intp), u[rows].astype(np.intp)

@@ -1,0 +1,49 @@
+"""How the identity of a plane is rendered: as a colour of the palette (Eq. 2), or as a scalar, for comparison."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tgslam import instance_field
+from tgslam.config.schema import StructureConfig
+from tgslam.planes import palette
+
+_LEAST, _MOST = 0.04, 0.96  # what a sigmoid (Eq. 1) reaches without saturating
+_NEUTRAL = 0.5  # what embeddings of 0 show: channels that carry nothing never move
+
+
+def codes_of(ids: ArrayLike, config: StructureConfig) -> NDArray[np.float32]:
+    """What ids of any shape [...] look like when they are rendered, [..., 3] in [0, 1].
+
+    identity: colour gives the palette's colours, black for -1. identity: scalar gives the id itself in the first
+    channel, scaled so that -1 and scalar_ids - 1 are the least and the most that a sigmoid (Eq. 1) reaches; larger ids
+    look alike.
+    """
+    if config.identity == "colour":
+        return palette.colours(ids)
+    steps = np.clip((np.asarray(ids, np.float64) + 1.0) / config.scalar_ids, 0.0, 1.0)
+    first = _LEAST + (_MOST - _LEAST) * steps
+    return np.stack([first, np.full_like(first, _NEUTRAL), np.full_like(first, _NEUTRAL)], axis=-1).astype(np.float32)
+
+
+def code_table(ids: NDArray[np.integer], config: StructureConfig) -> NDArray[np.float32]:
+    """[P + 1, 3] the table of `instance_field` in which plane k looks like ids[k] [P], -1 = like no plane."""
+    return codes_of(np.append(palette.NO_PLANE, ids), config)
+
+
+def read_ids(
+    embedding: np.ndarray, opacity: np.ndarray, known_ids: ArrayLike, config: StructureConfig
+) -> NDArray[np.int32]:
+    """The known id that each pixel of a rendering shows, [H, W], -1 = none; see `instance_field.read_ids`.
+
+    The nearest code is the rounded scalar where ids are scalars; the margin then is that share of a step.
+    """
+    ids = np.append(palette.NO_PLANE, np.asarray(known_ids, np.int64))
+    return instance_field.read_ids(embedding, opacity, ids, codes_of(ids, config), _margin(config), config.read_opacity)
+
+
+def _margin(config: StructureConfig) -> float:
+    if config.identity == "colour":
+        return config.read_margin
+    return config.read_margin * (_MOST - _LEAST) / config.scalar_ids
