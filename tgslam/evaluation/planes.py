@@ -52,7 +52,7 @@ def instance_metrics(
     read_ids: ReadIds,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> Metrics:
-    """The values of `INSTANCE_KEYS` over the frames at `poses` (position, T_wc): the ids that the map shows against labels.
+    """The values of `INSTANCE_KEYS` at `poses` (position, T_wc): the ids that the map shows against the frames' labels.
 
     T_alignment: estimated world to true world, as the trajectories align; without it the errors of the planes are null.
     All are null when there is no frame, no plane, or on a request to stop.
