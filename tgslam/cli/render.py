@@ -11,7 +11,7 @@ import numpy as np
 
 from tgslam.cli import engine
 from tgslam.errors import OutputError
-from tgslam.evaluation.instance_ids import rendered_ids
+from tgslam.evaluation.planes import ReadIds
 from tgslam.evaluation.protocol import Render
 from tgslam.geometry import inverse, se3_exp, transform_points
 from tgslam.output.images import write_colour, write_depth, write_depth_colours
@@ -63,7 +63,8 @@ def execute(args: argparse.Namespace) -> int:
     engine.start_device(args.device)
     render = engine.make_render(camera)
     if args.planes:
-        _write_plane_images(output, gaussians, poses, render, planes)
+        read_ids = engine.make_read_ids(camera, [plane.id for plane in planes], folder.read_config().structure)
+        _write_plane_images(output, gaussians, poses, render, read_ids, planes)
     else:
         _write_map_images(output, gaussians, poses, render)
     write_trajectory(output / "poses.txt", poses)
@@ -84,10 +85,14 @@ def _write_map_images(output: Path, gaussians: Gaussians, poses: Trajectory, ren
 
 
 def _write_plane_images(
-    output: Path, gaussians: Gaussians, poses: Trajectory, render: Render, planes: tuple[Plane, ...]
+    output: Path,
+    gaussians: Gaussians,
+    poses: Trajectory,
+    render: Render,
+    read_ids: ReadIds,
+    planes: tuple[Plane, ...],
 ) -> None:
     (output / "planes").mkdir(parents=True, exist_ok=True)
-    read_ids = rendered_ids(render, [plane.id for plane in planes])
     for number, T_wc in enumerate(poses.T_wc):
         T_cw = inverse(T_wc)
         image = plane_overlay(render(gaussians, T_cw).colour, read_ids(gaussians, T_cw), planes)

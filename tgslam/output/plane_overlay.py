@@ -45,9 +45,10 @@ def _print_id(image: Bytes, mask: NDArray[np.uint8], text: str, scale: float) ->
     if depth_px[row, column] < _LEAST_LABEL_PX:
         return
     (width, height), _ = cv2.getTextSize(text, _FONT, scale, 1)
-    origin = (int(column) - width // 2, int(row) + height // 2)
-    cv2.putText(image, text, origin, _FONT, scale, _BLACK, 3, cv2.LINE_AA)
-    cv2.putText(image, text, origin, _FONT, scale, _WHITE, 1, cv2.LINE_AA)
+    left, bottom = int(column) - width // 2, int(row) + height // 2
+    for right, down in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        cv2.putText(image, text, (left + right, bottom + down), _FONT, scale, _BLACK, 1, cv2.LINE_AA)
+    cv2.putText(image, text, (left, bottom), _FONT, scale, _WHITE, 1, cv2.LINE_AA)
 
 
 def _legend(planes: Sequence[Plane], height: int, scale: float) -> Bytes:
