@@ -16,10 +16,18 @@ F3 = ti.types.ndarray(dtype=ti.f32, ndim=3)
 I1 = ti.types.ndarray(dtype=ti.i32, ndim=1)
 I2 = ti.types.ndarray(dtype=ti.i32, ndim=2)
 
-BLOCK = WARP  # pixels whose sums one writer adds up: a thread on the CPU, a warp under CUDA
+BLOCK = WARP  # pixels of a row whose sums one writer adds up: a thread on the CPU, a warp under CUDA
 EDGE_PX = 2  # a boundary this near makes a pixel an edge
 RING = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 LOW, HIGH = 0.01, 0.99  # colours that embeddings keep to: beyond, the sigmoid has next to no slope
+
+
+@ti.func
+def start_of(block, width):
+    """Row and first column of a block of pixels; the last block of a row may end beyond it."""
+    per_row = (width + BLOCK - 1) // BLOCK
+    i = block // per_row
+    return i, (block - i * per_row) * BLOCK
 
 
 @ti.func
@@ -34,10 +42,8 @@ def is_edge(i, j, ids: ti.template(), depth: ti.template()):
 
 
 @ti.func
-def weigh_pixel(p, ids: ti.template(), depth: ti.template(), edge_boost, weight_none, weight: ti.template()):
-    """w_edge of pixel p; returns 1 where it counts, else 0."""
-    i = p // ids.shape[1]
-    j = p - i * ids.shape[1]
+def weigh_pixel(i, j, ids: ti.template(), depth: ti.template(), edge_boost, weight_none, weight: ti.template()):
+    """w_edge of a pixel; returns 1 where it counts, else 0."""
     w = 0.0
     if depth[i, j] > 0.0:
         w = ti.select(ids[i, j] >= 0, 1.0, weight_none)
@@ -57,26 +63,30 @@ def weigh(
     partial: F2,  # [1, blocks] out: pixels that count
 ):
     """The weights of Eq. 4, once a keyframe."""
-    pixels = ids.shape[0] * ids.shape[1]
+    height, width = ids.shape[0], ids.shape[1]
     if ti.static(ti.cfg.arch == ti.cuda):
         for p in range(partial.shape[1] * BLOCK):
+            i, first = start_of(p // BLOCK, width)
+            j = first + p % BLOCK
             counted = 0.0
-            if p < pixels:
-                counted = weigh_pixel(p, ids, depth, edge_boost, weight_none, weight)
+            if i < height and j < width:
+                counted = weigh_pixel(i, j, ids, depth, edge_boost, weight_none, weight)
             total = warp_sum(counted)
             if p % WARP == 0:
                 partial[0, p // WARP] = total
     else:
         for block in range(partial.shape[1]):
+            i, first = start_of(block, width)
             total = 0.0
-            for p in range(block * BLOCK, ti.min((block + 1) * BLOCK, pixels)):
-                total += weigh_pixel(p, ids, depth, edge_boost, weight_none, weight)
+            for j in range(first, ti.min(first + BLOCK, width)):
+                total += weigh_pixel(i, j, ids, depth, edge_boost, weight_none, weight)
             partial[0, block] = total
 
 
 @ti.func
 def pixel_slopes(
-    p,
+    i,
+    j,
     embedding: ti.template(),
     opacity: ti.template(),
     ids: ti.template(),
@@ -89,8 +99,6 @@ def pixel_slopes(
     w_embedding: ti.template(),
 ):
     """One pixel's part of `slopes`; returns its penalty before the mean."""
-    i = p // ids.shape[1]
-    j = p - i * ids.shape[1]
     row = ti.select(ids[i, j] + 1 < code.shape[0], ids[i, j] + 1, 0)
     wanted = ti.Vector([code[row, 0], code[row, 1], code[row, 2]])
     r = ti.Vector([embedding[i, j, 0], embedding[i, j, 1], embedding[i, j, 2]]) - opacity[i, j] * wanted
@@ -119,13 +127,15 @@ def slopes(
     partial: F2,  # [1, blocks] out: weighted penalties
 ):
     """E_pgi of Eq. 4 against opacity times the code: what is not covered has no identity, right or wrong."""
-    pixels = ids.shape[0] * ids.shape[1]
+    height, width = ids.shape[0], ids.shape[1]
     if ti.static(ti.cfg.arch == ti.cuda):
         for p in range(partial.shape[1] * BLOCK):
+            i, first = start_of(p // BLOCK, width)
+            j = first + p % BLOCK
             penalty = 0.0
-            if p < pixels:
+            if i < height and j < width:
                 penalty = pixel_slopes(
-                    p, embedding, opacity, ids, weight, code, share(scale, counted[0]), epsilon,
+                    i, j, embedding, opacity, ids, weight, code, share(scale, counted[0]), epsilon,
                     g_embedding, g_opacity, w_embedding,
                 )  # fmt: skip
             total = warp_sum(penalty)
@@ -133,10 +143,11 @@ def slopes(
                 partial[0, p // WARP] = total
     else:
         for block in range(partial.shape[1]):
+            i, first = start_of(block, width)
             total = 0.0
-            for p in range(block * BLOCK, ti.min((block + 1) * BLOCK, pixels)):
+            for j in range(first, ti.min(first + BLOCK, width)):
                 total += pixel_slopes(
-                    p, embedding, opacity, ids, weight, code, share(scale, counted[0]), epsilon,
+                    i, j, embedding, opacity, ids, weight, code, share(scale, counted[0]), epsilon,
                     g_embedding, g_opacity, w_embedding,
                 )  # fmt: skip
             partial[0, block] = total
@@ -184,7 +195,8 @@ def nearest_code(x, code: ti.template(), margin):
 
 @ti.func
 def read_pixel(
-    p,
+    i,
+    j,
     last,
     embedding: ti.template(),
     opacity: ti.template(),
@@ -195,9 +207,7 @@ def read_pixel(
     min_opacity,
     ids: ti.template(),
 ):
-    """Decode pixel p; returns the row of its code. A code in whose clear radius the colour lies needs no search."""
-    i = p // ids.shape[1]
-    j = p - i * ids.shape[1]
+    """Decode a pixel; returns the row of its code. A code in whose clear radius the colour lies needs no search."""
     row, found = last, -1
     if opacity[i, j] >= min_opacity:
         x = ti.Vector([embedding[i, j, 0], embedding[i, j, 1], embedding[i, j, 2]]) / opacity[i, j]
@@ -222,12 +232,13 @@ def read(
     ids: I2,  # [H, W] out, -1 = none, undecided, or too little opacity
 ):
     """The id whose code each pixel shows. On the CPU a pixel is first compared with what the one before it showed."""
-    pixels = ids.shape[0] * ids.shape[1]
+    height, width = ids.shape[0], ids.shape[1]
     if ti.static(ti.cfg.arch == ti.cuda):
-        for p in range(pixels):
-            read_pixel(p, 0, embedding, opacity, code, id_of, clear_square, margin, min_opacity, ids)
+        for i, j in ti.ndrange(height, width):
+            read_pixel(i, j, 0, embedding, opacity, code, id_of, clear_square, margin, min_opacity, ids)
     else:
-        for block in range((pixels + BLOCK - 1) // BLOCK):
+        for block in range(height * ((width + BLOCK - 1) // BLOCK)):
+            i, first = start_of(block, width)
             row = 0
-            for p in range(block * BLOCK, ti.min((block + 1) * BLOCK, pixels)):
-                row = read_pixel(p, row, embedding, opacity, code, id_of, clear_square, margin, min_opacity, ids)
+            for j in range(first, ti.min(first + BLOCK, width)):
+                row = read_pixel(i, j, row, embedding, opacity, code, id_of, clear_square, margin, min_opacity, ids)

@@ -8,7 +8,8 @@ import taichi as ti
 
 from tgslam.kernels.cuda.warp import WARP, warp_sum
 from tgslam.kernels.objective import charbonnier_root, share
-from tgslam.kernels.projection import quat_gradient, rotation_from_quat
+from tgslam.kernels.projection import rotation_from_quat
+from tgslam.kernels.simd import exp_neg
 
 F1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
 F2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
@@ -50,33 +51,29 @@ def regularise_one(
     """Add one Gaussian's gradients; returns its three penalties. weights: of the three, already over the count."""
     at = plane_id[i]
     normal = ti.Vector([plane[at, 0], plane[at, 1], plane[at, 2]])
-    # Flatness: scales relative to the middle one stay in range whatever the size
+    # Flatness
     logs = ti.Vector([log_scale[i, 0], log_scale[i, 1], log_scale[i, 2]])
     minor = ti.select(logs[1] < logs[0], 1, 0)
     minor = ti.select(logs[2] < ti.min(logs[0], logs[1]), 2, minor)
     least = ti.min(logs[0], ti.min(logs[1], logs[2]))
-    ratio = ti.exp(1.5 * least - 0.5 * logs.sum())  # s3 / sqrt(s1 s2)
+    ratio = exp_neg(0.5 * logs.sum() - 1.5 * least)  # s3 / sqrt(s1 s2); below 1/255 it is constant
     off = ratio - thinness
-    # Alignment
+    for k in ti.static(range(3)):
+        by_log = off * ti.select(minor == k, 2.0 * ratio, -thinness)
+        grad_log_scale[i, k] = grad_log_scale[i, k] + weights[0] * by_log
+    # Alignment: turning by a small t changes the quaternion q by t q / 2
     raw = ti.Vector([quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3]])
     inv_norm = 1.0 / raw.norm()
     q = raw * inv_norm
     R = rotation_from_quat(q[0], q[1], q[2], q[3])
-    axis = ti.Vector([0.0, 0.0, 0.0])
-    for k in ti.static(range(3)):
-        axis += ti.select(minor == k, 1.0, 0.0) * ti.Vector([R[0, k], R[1, k], R[2, k]])
+    axis = ti.Vector([ti.select(minor == 0, R[r, 0], ti.select(minor == 1, R[r, 1], R[r, 2])) for r in range(3)])
     cosine = axis.dot(normal)
-    towards = -weights[1] * ti.select(cosine < 0.0, -1.0, 1.0) * normal
-    H = R * 0.0
-    for k in ti.static(range(3)):
-        here = ti.select(minor == k, 1.0, 0.0)
-        grad_log_scale[i, k] = grad_log_scale[i, k] + weights[0] * off * ti.select(minor == k, 2.0 * ratio, -thinness)
-        for r in ti.static(range(3)):
-            H[r, k] = here * towards[r]
-    by_q = quat_gradient(H, q)
-    by_q = (by_q - q * by_q.dot(q)) * inv_norm
-    for c in ti.static(range(4)):
-        grad_quat[i, c] = grad_quat[i, c] + by_q[c]
+    turn = (2.0 * inv_norm * weights[1] * ti.select(cosine < 0.0, -1.0, 1.0)) * normal.cross(axis)
+    of_q = ti.Vector([q[1], q[2], q[3]])
+    by_vector = q[0] * turn + turn.cross(of_q)
+    grad_quat[i, 0] = grad_quat[i, 0] - turn.dot(of_q)
+    for c in ti.static(range(3)):
+        grad_quat[i, 1 + c] = grad_quat[i, 1 + c] + by_vector[c]
     # Distance
     height = per_sigma * (normal.dot(ti.Vector([mean[i, 0], mean[i, 1], mean[i, 2]])) + plane[at, 3])
     root = charbonnier_root(height * height, epsilon)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tgslam.errors import FrameError
 from tgslam.geometry import se3_exp
@@ -122,6 +123,13 @@ class FakeSystem:
         times_s = np.array([frame.timestamp_s for frame in frames], np.float64)
         poses = [true_pose(frame.index) for frame in frames]
         return Trajectory(times_s, np.stack(poses) if poses else np.zeros((0, 4, 4)))
+
+
+def fake_read_ids(gaussians: Gaussians, T_cw: Matrix4) -> NDArray[np.int32]:
+    """The left half of every image shows the one plane of `FakeSystem`."""
+    ids = np.full((CAMERA.height, CAMERA.width), -1, np.int32)
+    ids[:, : CAMERA.width // 2] = 4
+    return ids
 
 
 def fake_render(gaussians: Gaussians, T_cw: Matrix4) -> Rendering:

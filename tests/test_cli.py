@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.fakes import FakeSource, FakeSystem, fake_render
+from tests.fakes import FakeSource, FakeSystem, fake_read_ids, fake_render
 from tgslam.cli import engine, inputs, main
 from tgslam.evaluation.run_metrics import METRIC_KEYS
 from tgslam.output.trajectory_io import read_trajectory, write_trajectory
@@ -53,6 +53,7 @@ def world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> World:
     monkeypatch.setattr(engine, "start_device", lambda name: "cpu")
     monkeypatch.setattr(engine, "make_system", lambda camera, config: world.system)
     monkeypatch.setattr(engine, "make_render", lambda camera: fake_render)
+    monkeypatch.setattr(engine, "make_read_ids", lambda camera, ids, config: fake_read_ids)
     monkeypatch.chdir(tmp_path)
     return world
 
@@ -332,6 +333,22 @@ def test_render_writes_images_for_every_pose(world: World, capsys: pytest.Captur
     assert main(["render", "out", "--orbit"]) == 1
     assert "--overwrite" in one_error_line(capsys)
     assert main(["render", "out", "--orbit", "--count", "2", "--overwrite"]) == 0
+
+
+def test_render_shows_the_planes_of_the_keyframes(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "--output", "out"]) == 0
+    assert main(["render", "out", "--planes"]) == 0
+    folder = Path("out/render-planes")
+    assert {path.name for path in folder.iterdir()} == {"planes", "poses.txt"}
+    assert len(list((folder / "planes").iterdir())) == len(read_trajectory(folder / "poses.txt")) == 4
+    image = cv2.imread(str(folder / "planes" / "000000.png"))
+    assert image.shape[0] == 16
+    assert image[1, 20].tolist() == [153, 153, 153]  # the renderer's grey, and blended with the plane's orange:
+    np.testing.assert_allclose(image[1, 2], (np.array([0, 127.5, 255]) + 153) / 2, atol=1)
+    (Path("out") / "planes.json").unlink()
+    capsys.readouterr()
+    assert main(["render", "out", "--planes", "--overwrite"]) == 1
+    assert "no planes" in one_error_line(capsys)
 
 
 def test_an_orbit_keeps_looking_at_one_point(world: World) -> None:

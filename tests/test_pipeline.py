@@ -147,9 +147,8 @@ def test_two_runs_write_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
         folder = RunFolder.create(tmp_path / name, overwrite=False)
         pipeline.run(FakeSource(), FakeSystem(), folder)
-        files = (folder.trajectory, folder.keyframes, folder.map, folder.planes)
-        contents.append([path.read_bytes() for path in files])
-        contents[-1] += [path.read_bytes() for path in (folder.planes_mesh, folder.floorplan, folder.map_planes)]
+        paths = (folder.trajectory, folder.keyframes, folder.map, folder.planes, folder.planes_mesh, folder.floorplan)
+        contents.append([path.read_bytes() for path in paths])
     assert contents[0] == contents[1]
 
 

@@ -11,13 +11,13 @@ from tgslam.kernels.cuda.block import BLOCK
 from tgslam.kernels.cuda.warp import WARP
 
 
-def partial_sums(columns: int, items: int) -> np.ndarray:
-    """Uninitialised device array [columns, blocks] for the parts: a block is a warp of `items`.
+def partial_sums(columns: int, items: int, rows: int = 1) -> np.ndarray:
+    """Uninitialised device array [columns, blocks] for the parts of `rows` rows of `items`: a block is a warp of a row.
 
     Under CUDA there are as many as make whole thread blocks; kernels write them all.
     """
     unit = BLOCK // WARP if runtime.device() is runtime.Device.CUDA else 1
-    blocks = max(1, -(-items // WARP))
+    blocks = rows * max(1, -(-items // WARP))
     return runtime.empty((columns, -(-blocks // unit) * unit))
 
 

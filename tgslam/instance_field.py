@@ -54,7 +54,7 @@ class Workspace:
         self.embedding = runtime.empty((height, width, 3))
         self.weight = runtime.empty((height, width))
         self.penalties = runtime.empty((1,))
-        self.partial = partial_sums(1, height * width)
+        self.partial = partial_sums(1, width, height)
 
 
 def prepare(ids: ArrayLike, depth_m: np.ndarray, config: StructureConfig) -> InstanceTarget:
@@ -69,7 +69,7 @@ def prepare(ids: ArrayLike, depth_m: np.ndarray, config: StructureConfig) -> Ins
     on_device = runtime.to_device(np.asarray(ids, np.int32), np.int32)
     height, width = require("ids", on_device, (None, None), np.int32).shape
     require("depth_m", depth_m, (height, width))
-    weight, counted, partial = runtime.empty((height, width)), runtime.empty((1,)), partial_sums(1, height * width)
+    weight, counted, partial = runtime.empty((height, width)), runtime.empty((1,)), partial_sums(1, width, height)
     kernels.weigh(on_device, depth_m, config.edge_boost, config.weight_none, weight, partial)
     add_up(partial, counted)
     return InstanceTarget(on_device, weight, counted)

@@ -44,7 +44,12 @@ def execute(args: argparse.Namespace) -> int:
     groundtruth = _groundtruth(args.groundtruth, source)
     earlier = folder.read_metrics()
     found = evaluate_run(
-        folder, config.evaluation, source, groundtruth, make_render=lambda: engine.make_render(record.camera)
+        folder,
+        config.evaluation,
+        source,
+        groundtruth,
+        make_render=lambda: engine.make_render(record.camera),
+        make_read_ids=lambda ids: engine.make_read_ids(record.camera, ids, config.structure),
     )
     if args.groundtruth is not None and found["ate_rmse_all_cm"] is None:
         raise EvaluationError(f"{args.groundtruth}: cannot be compared with {folder.trajectory}; see the warning above")

@@ -11,12 +11,16 @@ import numpy as np
 
 from tgslam.cli import engine
 from tgslam.errors import OutputError
+from tgslam.evaluation.planes import ReadIds
+from tgslam.evaluation.protocol import Render
 from tgslam.geometry import inverse, se3_exp, transform_points
 from tgslam.output.images import write_colour, write_depth, write_depth_colours
+from tgslam.output.plane_overlay import plane_overlay
+from tgslam.output.planes_io import read_planes
 from tgslam.output.ply import read_map
 from tgslam.output.run_folder import RunFolder
 from tgslam.output.trajectory_io import read_trajectory, write_trajectory
-from tgslam.types import Gaussians, Matrix4, Trajectory
+from tgslam.types import Gaussians, Matrix4, Plane, Trajectory
 
 _log = logging.getLogger(__name__)
 _ORBIT_YAW_RAD = np.deg2rad(20.0)
@@ -31,12 +35,13 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
         "render",
         help="render images of a run's map",
         description="Write colour/, depth/ (16-bit PNG, 5000 units a metre, 0 = none) and depth_colours/, "
-        "one PNG a pose, and the poses themselves in poses.txt.",
+        "one PNG a pose, and the poses themselves in poses.txt; with --planes, planes/ instead of those.",
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--trajectory", type=Path, metavar="FILE", help="camera-to-world poses as TUM text")
     what.add_argument("--keyframes", action="store_true", help="the run's keyframes")
+    what.add_argument("--planes", action="store_true", help="the run's keyframes with the planes that the map shows")
     what.add_argument("--orbit", action="store_true", help="a closed swing round what the first keyframe looks at")
     parser.add_argument("--count", type=_positive, default=60, metavar="N", help="poses of --orbit (default: 60)")
     parser.add_argument("--output", type=Path, metavar="DIR", help="folder (default: RUN/render-...)")
@@ -50,12 +55,24 @@ def execute(args: argparse.Namespace) -> int:
     folder = RunFolder.open(args.run)
     camera = folder.read_record().camera
     gaussians = read_map(folder.map)
+    planes = _planes(folder) if args.planes else ()
     name, poses = _poses(args, folder, gaussians)
     output = args.output or folder.path / f"render-{name}"
     if output.exists() and (not output.is_dir() or any(output.iterdir())) and not args.overwrite:
         raise OutputError(f"{output}: is there already; choose another --output, or add --overwrite")
     engine.start_device(args.device)
     render = engine.make_render(camera)
+    if args.planes:
+        read_ids = engine.make_read_ids(camera, [plane.id for plane in planes], folder.read_config().structure)
+        _write_plane_images(output, gaussians, poses, render, read_ids, planes)
+    else:
+        _write_map_images(output, gaussians, poses, render)
+    write_trajectory(output / "poses.txt", poses)
+    _log.info("%d images of each kind are in %s", len(poses), output)
+    return 0
+
+
+def _write_map_images(output: Path, gaussians: Gaussians, poses: Trajectory, render: Render) -> None:
     for kind in ("colour", "depth", "depth_colours"):
         (output / kind).mkdir(parents=True, exist_ok=True)
     far_m = _far_m(gaussians, poses.T_wc[0])
@@ -65,9 +82,21 @@ def execute(args: argparse.Namespace) -> int:
         write_colour(output / "colour" / file_name, image.colour)
         write_depth(output / "depth" / file_name, image.depth_m)
         write_depth_colours(output / "depth_colours" / file_name, image.depth_m, far_m)
-    write_trajectory(output / "poses.txt", poses)
-    _log.info("%d images of each kind are in %s", len(poses), output)
-    return 0
+
+
+def _write_plane_images(
+    output: Path,
+    gaussians: Gaussians,
+    poses: Trajectory,
+    render: Render,
+    read_ids: ReadIds,
+    planes: tuple[Plane, ...],
+) -> None:
+    (output / "planes").mkdir(parents=True, exist_ok=True)
+    for number, T_wc in enumerate(poses.T_wc):
+        T_cw = inverse(T_wc)
+        image = plane_overlay(render(gaussians, T_cw).colour, read_ids(gaussians, T_cw), planes)
+        write_colour(output / "planes" / f"{number:06d}.png", image)
 
 
 def orbit(gaussians: Gaussians, T_wc: Matrix4, count: int) -> Trajectory:
@@ -94,11 +123,19 @@ def _poses(args: argparse.Namespace, folder: RunFolder, gaussians: Gaussians) ->
     if args.trajectory is not None:
         name, path = args.trajectory.stem, args.trajectory
     else:
-        name, path = "orbit" if args.orbit else "keyframes", folder.keyframes
+        name, path = "orbit" if args.orbit else "planes" if args.planes else "keyframes", folder.keyframes
     poses = read_trajectory(path)
     if not len(poses):
         raise OutputError(f"{path}: holds no pose")
     return name, orbit(gaussians, poses.T_wc[0], args.count) if args.orbit else poses
+
+
+def _planes(folder: RunFolder) -> tuple[Plane, ...]:
+    """The run's planes. Raises OutputError when it has none."""
+    planes = read_planes(folder.planes) if folder.planes.exists() else ()
+    if not planes:
+        raise OutputError(f"{folder.path}: this run has no planes to show")
+    return planes
 
 
 def _far_m(gaussians: Gaussians, T_wc: Matrix4) -> float:

@@ -151,7 +151,7 @@ class MappingConfig:
 class PlanesConfig:
     """Planes of single views, and the persistent ones (PGIs, section 3.3) that they are matched to."""
 
-    enabled: bool = setting(True)  # False: the map knows nothing of planes
+    enabled: bool = setting(False)  # False: the map knows nothing of planes
     # Segments of single views (section 3.2); sigmas are of the sensor's inverse depth at a pixel
     max_segments: int = setting(10, 1, 1000)  # K: the largest ones are kept
     cell_px: int = setting(8, 4, 64)  # squares of pixels that segmentation starts from
@@ -180,7 +180,7 @@ class PlanesConfig:
     weight_offset: float = setting(0.5, 0.0, 100.0)  # w_d of Eq. 7
     weight_overlap: float = setting(1.0, 0.0, 100.0)  # w_o of Eq. 7
     min_overlap: float = setting(0.25, 0.0, 1.0)  # intersection of the two masks over the smaller one
-    mask_width_px: int = setting(128, 16, 4096)  # the masks of Eq. 6 are at most this wide
+    mask_width_px: int = setting(96, 16, 4096)  # the masks of Eq. 6 are at most this wide
     max_gap_m: float = setting(0.1, 0.0, 10.0)  # surfaces this close to each other in their plane adjoin
     bridge_m: float = setting(3.0, 0.0, 100.0)  # likewise across a gap, unless a view looks through it
     bridge_area_m2: float = setting(0.9, 0.0, 1000.0)  # of both, where part of the gap is outside the image

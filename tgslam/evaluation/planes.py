@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
@@ -10,14 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.datasets.truth import SceneTruth
-from tgslam.evaluation.instance_ids import ReadIds
 from tgslam.evaluation.panoptic import IdentitySwitches, overlaps, panoptic
 from tgslam.geometry import inverse, transform_points
 from tgslam.types import Gaussians, Matrix4, Plane
 
-_log = logging.getLogger(__name__)
-
 Metrics = dict[str, float | None]
+ReadIds = Callable[[Gaussians, Matrix4], NDArray[np.int32]]  # plane [H, W] that the map shows seen from T_cw, -1 = none
 
 SUMMARY_KEYS = ("planes", "plane_area_m2", "plane_rms_mm")
 INSTANCE_KEYS = (
@@ -52,16 +49,11 @@ def instance_metrics(
     read_ids: ReadIds,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> Metrics:
-    """The values of `INSTANCE_KEYS` over the frames at `poses` (position, T_wc): the ids that the map shows, and labels.
+    """The values of `INSTANCE_KEYS` at `poses` (position, T_wc): the ids that the map shows against the frames' labels.
 
     T_alignment: estimated world to true world, as the trajectories align; without it the errors of the planes are null.
-    All are null when there is no frame, no plane, or on a request to stop.
+    All are null on a request to stop.
     """
-    if not planes or not poses:
-        _log.warning(
-            "no %s to compare with the scene: the metrics of instances are null", "frame" if planes else "plane"
-        )
-        return dict.fromkeys(INSTANCE_KEYS)
     counted = frozenset(np.flatnonzero(truth.plane_areas_m2() >= MIN_AREA_M2).tolist())
     switches, pixels = IdentitySwitches(), Counter[tuple[int, int]]()
     qualities = []

@@ -5,16 +5,17 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from tgslam.config.schema import EvaluationConfig
 from tgslam.datasets.source import RgbdSource
 from tgslam.errors import EvaluationError, OutputError
-from tgslam.evaluation.instance_ids import ReadIds, rendered_ids
 from tgslam.evaluation.planes import (
     FLOATER_KEY,
     INSTANCE_KEYS,
     SUMMARY_KEYS,
+    ReadIds,
     floater_share,
     instance_metrics,
     summary_metrics,
@@ -76,63 +77,84 @@ def evaluate_run(
     source: RgbdSource | None,
     groundtruth: Trajectory | None,
     make_render: Callable[[], Render] | None,
+    make_read_ids: Callable[[Collection[int]], ReadIds] | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
-    make_read_ids: Callable[[Render, Collection[int]], ReadIds] = rendered_ids,
 ) -> dict[str, Any]:
     """Every metric that the files of a run and its input give: the one way for both `run` and `eval`.
 
     make_render: makes the function that renders the map; None leaves the image metrics null, as no source does.
-    make_read_ids: makes the function that reads plane ids, of the known ones, off the map.
+    make_read_ids: makes the function that reads which of the known planes the map shows; None leaves the metrics of
+        instances null, as a scene without known planes does.
     Raises OutputError when the run was cut off before it wrote its trajectory, or a file of it is damaged, and
     EvaluationError when the input has changed since.
     """
     if not folder.trajectory.exists():
         raise OutputError(f"{folder.path}: this run did not come to its end: it has no {folder.trajectory.name}")
-    reports = read_log(folder.log)
-    every_frame, keyframes = read_trajectory(folder.trajectory), read_trajectory(folder.keyframes)
-    gaussians = read_map(folder.map)
-    planes = read_planes(folder.planes) if folder.planes.exists() else ()
-    metrics: dict[str, Any] = {**counts(reports), "keyframes": len(keyframes), "gaussians": len(gaussians)}
-    if folder.planes.exists():
-        metrics |= summary_metrics(planes)
+    run = _results(folder)
+    metrics: dict[str, Any] = {
+        **counts(run.reports),
+        "keyframes": len(run.keyframes),
+        "gaussians": len(run.gaussians),
+        **({} if run.planes is None else summary_metrics(run.planes)),
+    }
     if groundtruth is not None:
-        metrics |= trajectory_metrics(every_frame, keyframes, groundtruth, config)
+        metrics |= trajectory_metrics(run.every_frame, run.keyframes, groundtruth, config)
     if source is not None and make_render is not None:
-        if len(reports) > len(source):
+        if len(run.reports) > len(source):
             raise EvaluationError(
-                f"{source.name} has {len(source)} frames now, but this run saw {len(reports)}; restore its input"
+                f"{source.name} has {len(source)} frames now, but this run saw {len(run.reports)}; restore its input"
             )
         try:
-            poses = held_out_poses(reports, every_frame, config.holdout_interval)
+            poses = held_out_poses(run.reports, run.every_frame, config.holdout_interval)
         except EvaluationError as error:
             raise EvaluationError(f"{folder.trajectory}: {error}") from error
-        render = make_render()
-        metrics |= image_metrics(source, poses, gaussians, render, stop_requested)
-        read_ids = make_read_ids(render, [plane.id for plane in planes])
-        metrics |= _scene_metrics(source, every_frame, config, planes, gaussians, poses, read_ids, stop_requested)
+        metrics |= image_metrics(source, poses, run.gaussians, make_render(), stop_requested)
+        metrics |= _scene_metrics(run, source, poses, config, make_read_ids, stop_requested)
     return metrics
 
 
+@dataclass(frozen=True)
+class _Results:
+    """What a run has written."""
+
+    reports: list[FrameReport]
+    every_frame: Trajectory
+    keyframes: Trajectory
+    gaussians: Gaussians
+    planes: tuple[Plane, ...] | None  # None: the file is not there
+
+
+def _results(folder: RunFolder) -> _Results:
+    return _Results(
+        reports=read_log(folder.log),
+        every_frame=read_trajectory(folder.trajectory),
+        keyframes=read_trajectory(folder.keyframes),
+        gaussians=read_map(folder.map),
+        planes=read_planes(folder.planes) if folder.planes.exists() else None,
+    )
+
+
 def _scene_metrics(
+    run: _Results,
     source: RgbdSource,
-    every_frame: Trajectory,
-    config: EvaluationConfig,
-    planes: Sequence[Plane],
-    gaussians: Gaussians,
     poses: Sequence[tuple[int, Matrix4]],
-    read_ids: ReadIds,
+    config: EvaluationConfig,
+    make_read_ids: Callable[[Collection[int]], ReadIds] | None,
     stop_requested: Callable[[], bool],
 ) -> dict[str, Any]:
     """What comparing with the scene itself gives; null for a recording, whose scene nobody knows."""
+    metrics: dict[str, Any] = dict.fromkeys((*INSTANCE_KEYS, FLOATER_KEY))
     truth = source.truth()
     groundtruth = None if truth is None else source.groundtruth()  # in the truth's world, whatever else was compared
     if truth is None or groundtruth is None or stop_requested():
-        return dict.fromkeys((*INSTANCE_KEYS, FLOATER_KEY))
-    T_alignment = _alignment(every_frame, groundtruth, config.association_tolerance_s)
-    return {
-        **instance_metrics(planes, gaussians, poses, truth, T_alignment, read_ids, stop_requested),
-        FLOATER_KEY: None if T_alignment is None else floater_share(gaussians, truth, T_alignment),
-    }
+        return metrics
+    T_alignment = _alignment(run.every_frame, groundtruth, config.association_tolerance_s)
+    if T_alignment is not None:
+        metrics[FLOATER_KEY] = floater_share(run.gaussians, truth, T_alignment)
+    if make_read_ids is not None and run.planes and poses:
+        read_ids = make_read_ids([plane.id for plane in run.planes])
+        metrics |= instance_metrics(run.planes, run.gaussians, poses, truth, T_alignment, read_ids, stop_requested)
+    return metrics
 
 
 def _alignment(estimate: Trajectory, groundtruth: Trajectory, tolerance_s: float) -> Matrix4 | None:

@@ -19,7 +19,6 @@ from tgslam.output.floorplan import write_floorplan
 from tgslam.output.log import plain
 from tgslam.output.plane_colours import in_plane_colours
 from tgslam.output.planes_io import write_planes
-from tgslam.output.planes_mesh import write_mesh
 from tgslam.output.ply import write_vertices
 from tgslam.types import Camera, Gaussians, Plane
 
@@ -151,6 +150,8 @@ class RunFolder:
 
         Raises OutputError for values that are not finite, and OSError.
         """
+        from tgslam.output.planes_mesh import write_mesh  # brings in trimesh, which everything else does without
+
         write_planes(self.planes, planes)
         if planes:
             write_floorplan(self.floorplan, planes)

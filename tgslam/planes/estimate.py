@@ -142,6 +142,8 @@ def fuse(planes: PlaneEstimate, independent: float = np.inf) -> PlaneEstimate:
         mean = np.linalg.solve(total, np.einsum("n,nij,nj->i", weights, information, values))
         residual = values - mean
         sigmas = np.sqrt(np.einsum("ni,nij,nj->n", residual, information, residual))
+        if sigmas.max() <= _HUBER_DEVIATION and weights.min() == 1.0:
+            break
         weights = _HUBER_DEVIATION / np.maximum(sigmas, _HUBER_DEVIATION)
     covariance = np.linalg.inv(total) * max(1.0, len(values) / independent)
     return _retracted(reference, pivot, mean, covariance)
