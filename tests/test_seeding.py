@@ -15,7 +15,8 @@ from tgslam.datasets.synthetic import SyntheticSource
 from tgslam.evaluation.images import masked_psnr
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, se3_exp, transform_points
 from tgslam.kernels import seeding as kernels
-from tgslam.mapping.seeding import Cells, quadtree, seed
+from tgslam.mapping.seeding import Cells, cell_sizes, quadtree, seed
+from tgslam.planes import palette
 from tgslam.render import Rasterizer
 from tgslam.types import Camera, Frame, Gaussians
 
@@ -76,26 +77,63 @@ def patchy_frames(draw: st.DrawFn) -> tuple[NDArray, NDArray, NDArray]:
     return 0.5 + texture, depth_m, wanted
 
 
+@pytest.mark.parametrize("on_planes_only", [False, True])
 @pytest.mark.parametrize("shape", [(24, 32), (37, 51), (5, 3)])
 @pytest.mark.parametrize("size", [1, 2, 4, 8])
-def test_plain_and_planar_cells_match_the_twin(shape: tuple[int, int], size: int) -> None:
+def test_plain_and_planar_cells_match_the_twin(shape: tuple[int, int], size: int, on_planes_only: bool) -> None:
     rng = np.random.default_rng(size)
     v, u = np.mgrid[: shape[0], : shape[1]]
     rough = np.where(u + v < 0.4 * sum(shape), 0.0, rng.random(shape))
     depth_m = 1.0 / (0.5 + 0.002 * u - 0.003 * v + 0.003 * rough * rng.normal(size=shape) + 0.1 * (u > 30))
     depth_m[rng.random(shape) < 0.02] = 0.0
     colour = 0.5 + 0.03 * (rough * rng.random(shape))[..., None] * rng.normal(size=(*shape, 3))
+    colour += (0.002 * (u - v))[..., None] * (u > 16)[..., None]
+    ids = np.where(u > 16, np.where(v > 12, 5, 2), -1).astype(np.int32)
     depth_m, colour = (image.astype(np.float32) for image in (depth_m, colour))
-    complete, spread, residual = cell_measures(colour.astype(float), depth_m.astype(float), size)
-    cells = runtime.empty(complete.shape, np.int32)
-    images_on_device = runtime.to_device(colour), runtime.to_device(depth_m)
-    kernels.plain_and_planar(*images_on_device, size, 0.01, 0.001, cells)
-    clear = (abs(spread - 0.01) > 1e-6) & (abs(residual - 0.001) > 3e-7)  # not at a threshold
+    cells = cell_measures(colour.astype(float), depth_m.astype(float), ids, size)
+    actual = runtime.empty(cells.complete.shape, np.int32)
+    on_device = runtime.to_device(colour), runtime.to_device(depth_m), runtime.to_device(ids, np.int32)
+    kernels.plain_and_planar(*on_device, size, 0.01, 0.006, 0.001, on_planes_only, actual)
+    spread = np.where(cells.on_plane, cells.detrended, cells.spread)
+    limit = np.where(cells.on_plane, 0.006, 0.01)
+    clear = (abs(spread - limit) > 1e-6) & (abs(cells.residual - 0.001) > 3e-7)  # not at a threshold
     assert clear.mean() > 0.99
-    expected = complete & (spread < 0.01) & (residual < 0.001)
-    np.testing.assert_array_equal((runtime.to_host(cells) > 0)[clear], expected[clear])
+    good = cells.complete & (spread < limit) & (cells.residual < 0.001) & (cells.on_plane | (not on_planes_only))
+    expected = np.where(good, np.where(cells.on_plane, kernels.ON_PLANE, kernels.PLAIN_AND_PLANAR), 0)
+    np.testing.assert_array_equal(runtime.to_host(actual)[clear], expected[clear])
     if shape[0] > 30 and size in (2, 4):
-        assert 0 < expected.sum() < complete.sum() < complete.size
+        assert 0 < good.sum() < cells.complete.sum() < cells.complete.size
+        assert kernels.ON_PLANE in expected
+
+
+def test_cells_on_a_plane_grow_larger_and_ignore_a_trend_and_small_gaps() -> None:
+    v, u = np.mgrid[:64, :128]
+    depth_m = np.full(v.shape, 2.0, np.float32)
+    colour = np.repeat((0.2 + 0.004 * u)[..., None], 3, -1).astype(np.float32)
+    ids = np.where(u < 64, 3, -1).astype(np.int32)
+    config = SeedingConfig(smallest_cell_px=2, cell_levels=3, plane_cell_levels=5)
+    sizes = cell_sizes(colour, depth_m, config, SIGMA, ids)
+    assert (sizes[:, :32] == 32).all()  # the plane, whose colour is plain but for its trend
+    assert (sizes[:, 32:] < 16).all()  # elsewhere as without planes
+    wanted = np.zeros(v.shape, bool)
+    wanted[:32, :20], wanted[40:42, 10:12] = True, True  # most of a large cell; a crumb
+    cells = quadtree(colour, depth_m, wanted, config, SIGMA, ids)
+    assert cells.size_px.tolist() == [32.0]
+    without = quadtree(colour, depth_m, wanted, config, SIGMA)
+    assert without.size_px.max() <= 8 and len(without.u) > 10
+
+
+def test_gaussians_on_a_plane_know_it() -> None:
+    depth_m = np.full((32, 32), 2.0, np.float32)
+    ids = np.where(np.mgrid[:32, :32][1] < 16, 3, -1).astype(np.int32)
+    camera = Camera(32, 32, 30.0, 30.0, 15.5, 15.5)
+    cells = quadtree(grey(depth_m), depth_m, everywhere(depth_m), CONFIG, SIGMA, ids)
+    normals = np.zeros((32, 32, 3), np.float32)
+    new = seed(cells, normals, camera, np.eye(4), 0, CONFIG, ids)
+    assert set(new.plane_id[cells.u < 15]) == {3}
+    assert set(new.plane_id[cells.u > 17]) == {-1}
+    shown = 1.0 / (1.0 + np.exp(-new.embedding))
+    np.testing.assert_allclose(shown, palette.colours(new.plane_id), atol=0.021)
 
 
 @settings(max_examples=150)

@@ -57,7 +57,7 @@ class Mapper:
         )
         self.conflict += surface.seen_through
         self.support += surface.supported
-        planes = self._observe_planes(keyframe)
+        planes = self._observe_planes()
         kept = ~(self.guessed & surface.measured) & ~self._too_coarse(keyframe, surface, planes)
         self._keep(kept)
         self._fuse(keyframe, surface, kept)
@@ -76,11 +76,11 @@ class Mapper:
                 self.refiner.step(self.gaussians, self.keyframes[k], move_pose=False)
         self._prune()
 
-    def _observe_planes(self, keyframe: Keyframe) -> PlanarPixels | None:
-        """The PGIs in the keyframe, which refinement hears of too."""
+    def _observe_planes(self) -> PlanarPixels | None:
+        """The PGIs in the last keyframe, which refinement hears of too."""
         if not self.planes:
             return None
-        pixels = self.planes.observe(keyframe, len(self.keyframes) - 1)
+        pixels = self.planes.observe(self.keyframes)
         if self.refiner.structure:
             self.refiner.structure.set_planes(*self.planes.table())
         return pixels

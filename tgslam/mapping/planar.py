@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from tgslam import runtime
 from tgslam.config.schema import PlanesConfig
 from tgslam.gaussian_map import GaussianMap
-from tgslam.geometry import transform_points
+from tgslam.geometry import inverse, transform_points
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.planes.extraction import extract_planes
 from tgslam.planes.instance import NO_ID, PlanarInstance
@@ -39,6 +40,7 @@ class PlanarMapping:
         """sigma_per_m2: the sensor's noise, sigma_z = this * z^2."""
         self.camera, self.config, self.sigma_per_m2 = camera, config, sigma_per_m2
         self.registry = PlaneRegistry(config, sigma_per_m2)
+        self._T_cw: list[NDArray[np.float64]] = []  # of each keyframe, as the PGIs know it
         v, u = np.mgrid[: camera.height, : camera.width]
         self._rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], -1)
 
@@ -47,8 +49,14 @@ class PlanarMapping:
         """The PGIs by id."""
         return self.registry.instances
 
-    def observe(self, keyframe: Keyframe, number: int) -> PlanarPixels:
-        """Match a keyframe's planes to the PGIs. number: of the keyframe, growing from call to call."""
+    def observe(self, keyframes: Sequence[Keyframe]) -> PlanarPixels:
+        """Match the last keyframe's planes to the PGIs, which first follow the others where refinement has moved them.
+
+        keyframes: all of the run so far, one more at each call.
+        """
+        self._follow(keyframes)
+        keyframe, number = keyframes[-1], len(keyframes) - 1
+        self._T_cw.append(keyframe.T_cw.copy())
         depth_m = keyframe.depth_m()
         view = extract_planes(runtime.to_device(depth_m), self.camera, self.config, self.sigma_per_m2)
         observation = self.registry.observe(view, depth_m, self.camera, keyframe.T_cw, number)
@@ -83,6 +91,17 @@ class PlanarMapping:
             distance = np.abs(means[named] @ instance.normal_w + instance.offset_m)
             plane_ids[named[distance < self.config.max_distance_m]] = plane_id
         gaussians.write("plane_id", slice(0, gaussians.count), plane_ids)
+
+    def _follow(self, keyframes: Sequence[Keyframe]) -> None:
+        """Move the PGIs with the keyframes that saw them."""
+        corrections = {}
+        for number, known in enumerate(self._T_cw):
+            T_cw = keyframes[number].T_cw
+            if not np.array_equal(T_cw, known):
+                corrections[number] = inverse(T_cw) @ known
+                self._T_cw[number] = T_cw.copy()
+        if corrections:
+            self.registry.moved(corrections)
 
     def _pixels(
         self, ids: NDArray[np.int32], measured_m: NDArray[np.float32], T_cw: NDArray[np.float64]

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from tgslam import runtime
 from tgslam.config.schema import SeedingConfig
 from tgslam.geometry import inverse, quat_wxyz_from_matrices, transform_points
+from tgslam.instance_field import theta_of
 from tgslam.kernels import seeding as kernels
-from tgslam.planes.palette import embedding_of
+from tgslam.planes import palette
 from tgslam.types import Camera, Gaussians
 
 _MIN_COSINE = 0.25  # foreshortening is compensated up to here: beyond, a cell's Gaussian would become a needle
@@ -210,7 +211,7 @@ def seed(
         quat_wxyz=quat_wxyz_from_matrices(axes).astype(np.float32),
         opacity_logit=np.full(n, np.log(config.opacity / (1.0 - config.opacity)), np.float32),
         colour=cells.colour.astype(np.float32),
-        embedding=np.zeros((n, 3), np.float32) if plane_ids is None else embedding_of(ids),
+        embedding=np.zeros((n, 3), np.float32) if plane_ids is None else theta_of(palette.colours(ids)),
         plane_id=ids.astype(np.int32),
         birth_keyframe=np.full(n, keyframe, np.int32),
     )

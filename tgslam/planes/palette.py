@@ -11,7 +11,6 @@ NO_PLANE = -1  # its colour is black
 _LEVELS = 17  # of the lattice of colours, per channel: 4,913 colours before the first one repeats
 _LOW, _HIGH = 0.04, 0.96  # what a sigmoid (Eq. 1) reaches without saturating
 _FIRST_BLOCK = 64
-_DARKEST = 0.02  # colours nearer to 0 and 1 would take an embedding too far out to come back
 
 
 def colours(ids: ArrayLike) -> NDArray[np.float32]:
@@ -37,12 +36,6 @@ def ids_of(observed: NDArray[np.floating], known_ids: NDArray[np.integer], margi
     nearest = np.argmin(squared, axis=1)
     two = np.sqrt(np.maximum(np.partition(squared, 1, axis=1)[:, :2], 0.0))
     return np.where(two[:, 1] - two[:, 0] >= margin, candidates[nearest], NO_PLANE).astype(np.int32)
-
-
-def embedding_of(ids: ArrayLike) -> NDArray[np.float32]:
-    """theta of Eq. 1 whose sigmoid is the colour of plane ids [N] -> [N, 3]."""
-    colour = np.clip(colours(ids), _DARKEST, 1.0 - _DARKEST)
-    return np.log(colour / (1.0 - colour)).astype(np.float32)
 
 
 def _squared_distances(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
