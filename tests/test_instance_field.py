@@ -15,6 +15,7 @@ from tgslam.planes import palette
 from tgslam.planes.codes import code_table, codes_of, read_ids
 
 CONFIG = StructureConfig(lambda_pgi=0.7, scalar_ids=12)
+OTHER = 2.0**-10  # a derivative by opacity that is there before
 SIZES = [(48, 64), (37, 50), (9, 33)]
 
 
@@ -32,14 +33,14 @@ def scene(height=37, width=50, seed=0):
 
 
 def evaluate(rendering, ids, depth, codes, config=CONFIG):
-    """E_pgi's gradient, the target, and the derivative by opacity, on top of ones."""
+    """E_pgi's gradient, the target, and the derivative by opacity, which was added to another one."""
     target = instance_field.prepare(ids, runtime.to_device(depth), config)
-    g_opacity = runtime.to_device(np.ones(ids.shape))
+    g_opacity = runtime.to_device(np.full(ids.shape, OTHER))
     embedding, opacity = (runtime.to_device(image) for image in rendering)
     found = instance_field.pgi_loss(
         embedding, opacity, target, runtime.to_device(codes), config, g_opacity, instance_field.Workspace(*ids.shape)
     )
-    return found, target, runtime.to_host(g_opacity) - 1.0
+    return found, target, runtime.to_host(g_opacity) - np.float32(OTHER)
 
 
 @pytest.mark.parametrize("size", SIZES)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tgslam.errors import EvaluationError
-from tgslam.evaluation.panoptic import IdentitySwitches, overlaps, panoptic
+from tgslam.evaluation.panoptic import IdentitySwitches, overlaps, panoptic, shown
 
 LABELS = np.full((20, 40), -1, np.int32)
 LABELS[:, :20] = 0  # 400 px
@@ -19,7 +19,8 @@ COUNTED = {0, 3}
 
 
 def score(*ids: np.ndarray, labels: np.ndarray = LABELS, counted: set[int] = COUNTED):
-    return panoptic(sum((overlaps(labels, one) for one in ids), Counter()), counted)
+    pixels = sum((overlaps(labels, one) for one in ids), Counter())
+    return panoptic(pixels, counted, {id_ for _, id_ in pixels} - {-1})
 
 
 def switches(*ids: np.ndarray, labels: np.ndarray = LABELS) -> IdentitySwitches:
@@ -128,16 +129,23 @@ def test_changes_of_the_larger_part_of_a_split_plane_are_switches() -> None:
     assert switches(*frames, *frames[::-1]).switches == 2
 
 
-def test_slivers_and_scraps_have_no_identity() -> None:
-    sliver = np.full_like(LABELS, -1)
-    sliver[0, 0] = 0
+def test_what_covers_a_scrap_of_a_plane_is_not_its_identity() -> None:
     counter = switches(renamed({0: 1}))
-    counter.add(overlaps(sliver, np.full_like(LABELS, 7)), COUNTED)
-    assert counter.switches == 0
     scrap = np.full_like(LABELS, -1)
     scrap[:4, :20] = 7  # a fifth of label 0
     counter.add(overlaps(LABELS, scrap), COUNTED)
     assert counter.switches == 0
+
+
+def test_scraps_of_an_image_are_no_instances() -> None:
+    labels = np.full((50, 40), -1, np.int32)
+    labels[:, :20], labels[0, 30:34], labels[0, 35:38] = 0, 1, 2
+    ids = np.where(labels == 0, np.int32(8), np.int32(-1))
+    ids[10, 30:34], ids[20, 30:33] = 5, 6
+    found = overlaps(labels, ids)
+    assert shown(found) == ({0, 1}, {8, 5})
+    assert panoptic(found, *shown(found)).quality == pytest.approx(1 / (1 + 0.5 + 0.5))
+    assert panoptic(found, {0}, {8}).quality == 1
 
 
 def test_images_of_two_sizes_are_an_error() -> None:
@@ -152,7 +160,7 @@ small_images = st.lists(st.tuples(st.integers(-1, 3), st.integers(-1, 4)), min_s
 def test_scores_agree_with_sets_of_pixels(pixels: list[tuple[int, int]]) -> None:
     """Against the definition, with sets in place of counts; label 2 is void."""
     labels, ids = np.array(pixels, np.int32).T[:, None]
-    found = panoptic(overlaps(labels, ids), {0, 1, 3})
+    found = panoptic(overlaps(labels, ids), {0, 1, 3}, range(5))
     void = {i for i, (label, _) in enumerate(pixels) if label == 2}
     true = {t: {i for i, p in enumerate(pixels) if p[0] == t} for t in (0, 1, 3)}
     predicted = {q: {i for i, p in enumerate(pixels) if p[1] == q} for q in range(5)}
@@ -176,7 +184,7 @@ def test_scores_agree_with_sets_of_pixels(pixels: list[tuple[int, int]]) -> None
 @given(small_images, st.permutations(range(5)))
 def test_renaming_ids_changes_nothing(pixels: list[tuple[int, int]], names: list[int]) -> None:
     labels, ids = np.array(pixels, np.int32).T[:, None]
-    one = panoptic(overlaps(labels, ids), {0, 1, 3})
-    other = panoptic(overlaps(labels, np.append(names, -1)[ids].astype(np.int32)), {0, 1, 3})
+    one = panoptic(overlaps(labels, ids), {0, 1, 3}, range(5))
+    other = panoptic(overlaps(labels, np.append(names, -1)[ids].astype(np.int32)), {0, 1, 3}, range(5))
     assert other.quality == (None if one.quality is None else pytest.approx(one.quality))
     assert (one.precision, one.recall) == (other.precision, other.recall)

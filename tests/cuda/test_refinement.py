@@ -7,14 +7,15 @@ import pytest
 
 from tests.cuda.harness import GRIDS, Devices
 from tests.cuda.scenarios import refinement
+from tgslam.gaussian_map import PARAMETERS
 from tools.cudacheck.environment import Grid
 
 pytestmark = [pytest.mark.cuda_check, pytest.mark.parametrize("grid", GRIDS)]
 
 
-@pytest.mark.parametrize("optimizer", ["relaxation", "adam"])
-def test_the_map_and_the_pose_move_alike(devices: Devices, grid: Grid, optimizer: str) -> None:
-    cpu, cuda = devices.both(refinement.steps, grid, optimizer=optimizer)
+@pytest.mark.parametrize(("optimizer", "planes"), [("relaxation", False), ("adam", False), ("relaxation", True)])
+def test_the_map_and_the_pose_move_alike(devices: Devices, grid: Grid, optimizer: str, planes: bool) -> None:
+    cpu, cuda = devices.both(refinement.steps, grid, optimizer=optimizer, planes=planes)
     np.testing.assert_array_equal(cuda["views"], cpu["views"])
     assert 0.5 < (cpu["views"] == 3).mean() < 0.95
     np.testing.assert_allclose(cuda["values"], cpu["values"], rtol=1e-4)
@@ -22,7 +23,8 @@ def test_the_map_and_the_pose_move_alike(devices: Devices, grid: Grid, optimizer
     np.testing.assert_allclose(cuda["pose"], cpu["pose"], atol=2e-6)
     scale = cpu["contribution"].max()
     np.testing.assert_allclose(cuda["contribution"], cpu["contribution"], rtol=1e-3, atol=1e-4 * scale)
-    for name in ("mean", "log_scale", "quat_wxyz", "opacity_logit", "colour"):
+    assert cpu["embedding"].any() == planes
+    for name in PARAMETERS:
         # Adam's first steps have the rate's length whatever the gradient: where it is about 0, rounding decides
         off = np.abs(cuda[name] - cpu[name]).reshape(len(cpu[name]), -1).max(axis=1)
         assert (off > 2e-4).mean() < 0.01, name

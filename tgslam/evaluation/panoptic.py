@@ -1,7 +1,8 @@
 """How well predicted instances are the true ones, counted in pixels of id images over one frame or a whole sequence.
 
-A true instance is one label, a predicted one is one id; negative values are neither. Labels that are not `counted` are
-void: whatever is predicted on their pixels is neither right nor wrong.
+A true instance is one label, a predicted one is one id; negative values are neither. Instances have to be large enough
+to count. Other labels are void: what is predicted on their pixels is neither right nor wrong. Other ids are taken as no
+prediction: where colours blend into each other, a few pixels read as anything.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ IdImage = NDArray[np.int32]
 Overlaps = Mapping[tuple[int, int], int]  # (true label, predicted id) -> pixels
 
 _MATCH_IOU = 0.5  # above it at most one prediction fits a label, and one label a prediction
-_VISIBLE_SHARE = 0.002  # of the image that a label covers: less of it says nothing about who it is
+_SHOWN_SHARE = 0.002  # of the image that an instance covers: less is a scrap
 _IDENTITY_SHARE = 0.25  # of a label's pixels that an id covers: less is no identity
 
 
@@ -42,16 +43,27 @@ def overlaps(labels: IdImage, ids: IdImage) -> Counter[tuple[int, int]]:
     return Counter({(int(label), int(id_)): int(n) for label, id_, n in zip(*pairs, pixels, strict=True)})
 
 
-def panoptic(pixels: Overlaps, counted: Collection[int]) -> PanopticScore:
+def shown(pixels: Overlaps) -> tuple[frozenset[int], frozenset[int]]:
+    """The labels and the ids that cover enough of one frame to be instances in it."""
+    least = _SHOWN_SHARE * sum(pixels.values())
+    sizes: tuple[Counter[int], Counter[int]] = Counter(), Counter()
+    for pair, count in pixels.items():
+        for size, value in zip(sizes, pair, strict=True):
+            size[value] += count
+    labels, ids = (frozenset(v for v, count in size.items() if v >= 0 and count >= least) for size in sizes)
+    return labels, ids
+
+
+def panoptic(pixels: Overlaps, labels: Collection[int], ids: Collection[int]) -> PanopticScore:
     """The score of one frame, or of the sum of several: then an instance is all its pixels of all frames.
 
-    A prediction that lies for more than half on void is no false one.
+    labels, ids: the instances that count. A prediction that lies for more than half on void is no false one.
     """
     true_px: Counter[int] = Counter()
     predicted_px: Counter[int] = Counter()
     void_px: Counter[int] = Counter()
     for (label, id_), count in pixels.items():
-        if label >= 0 and label not in counted:
+        if label >= 0 and label not in labels:
             void_px[id_] += count
             continue
         true_px[label] += count
@@ -60,10 +72,10 @@ def panoptic(pixels: Overlaps, counted: Collection[int]) -> PanopticScore:
     ious = {
         (label, id_): count / (true_px[label] + predicted_px[id_] - count)
         for (label, id_), count in pixels.items()
-        if label in true and id_ >= 0
+        if label in true and id_ in ids
     }
     matched = {pair: iou for pair, iou in ious.items() if iou > _MATCH_IOU}
-    judged = {id_ for id_ in predicted_px if id_ >= 0 and predicted_px[id_] >= void_px[id_]}
+    judged = {id_ for id_ in predicted_px if id_ in ids and predicted_px[id_] >= void_px[id_]}
     judged |= {id_ for _, id_ in matched}
     total = float(sum(matched.values()))
     return PanopticScore(
@@ -87,13 +99,11 @@ class IdentitySwitches:
         self.switches = 0
         self._latest: dict[int, int] = {}
 
-    def add(self, pixels: Overlaps, counted: Collection[int]) -> None:
-        """Take the overlaps of the next frame."""
+    def add(self, pixels: Overlaps, labels: Collection[int]) -> None:
+        """Take the overlaps of the next frame, and the labels that count in it."""
         self.frames += 1
-        size = sum(pixels.values())
-        for label in {label for label, _ in pixels if label in counted}:
-            found = {id_: count for (other, id_), count in pixels.items() if other == label}
-            identity = _identity(found, size)
+        for label in labels:
+            identity = _identity({id_: count for (other, id_), count in pixels.items() if other == label})
             if identity is not None:
                 self.switches += self._latest.get(label, identity) != identity
                 self._latest[label] = identity
@@ -104,14 +114,13 @@ class IdentitySwitches:
         return _ratio(100.0 * self.switches, self.frames)
 
 
-def _identity(pixels: Mapping[int, int], image_px: int) -> int | None:
+def _identity(pixels: Mapping[int, int]) -> int | None:
     """The id of a label that shows these pixels by predicted id; of equals, the smaller one."""
-    shown = sum(pixels.values())
     known = {id_: count for id_, count in pixels.items() if id_ >= 0}
-    if not known or shown < _VISIBLE_SHARE * image_px:
+    if not known:
         return None
     best = min(known, key=lambda id_: (-known[id_], id_))
-    return best if known[best] >= _IDENTITY_SHARE * shown else None
+    return best if known[best] >= _IDENTITY_SHARE * sum(pixels.values()) else None
 
 
 def _ratio(part: float, whole: float) -> float | None:

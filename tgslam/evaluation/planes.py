@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.datasets.truth import SceneTruth
-from tgslam.evaluation.panoptic import IdentitySwitches, overlaps, panoptic
+from tgslam.evaluation.panoptic import IdentitySwitches, overlaps, panoptic, shown
 from tgslam.geometry import inverse, transform_points
 from tgslam.types import Gaussians, Matrix4, Plane
 
@@ -51,20 +51,25 @@ def instance_metrics(
 ) -> Metrics:
     """The values of `INSTANCE_KEYS` at `poses` (position, T_wc): the ids that the map shows against the frames' labels.
 
+    A plane counts in the frames that show enough of it, and over the sequence when there is such a frame.
     T_alignment: estimated world to true world, as the trajectories align; without it the errors of the planes are null.
     All are null on a request to stop.
     """
-    counted = frozenset(np.flatnonzero(truth.plane_areas_m2() >= MIN_AREA_M2).tolist())
-    switches, pixels = IdentitySwitches(), Counter[tuple[int, int]]()
-    qualities = []
+    large = frozenset(np.flatnonzero(truth.plane_areas_m2() >= MIN_AREA_M2).tolist())
+    switches, pixels, qualities = IdentitySwitches(), Counter[tuple[int, int]](), []
+    all_labels, all_ids = set[int](), set[int]()
     for position, T_wc in poses:
         if stop_requested():
             return dict.fromkeys(INSTANCE_KEYS)
         found = overlaps(truth.labels(position), read_ids(gaussians, inverse(T_wc)))
-        switches.add(found, counted)
-        qualities.append(panoptic(found, counted).quality)
+        labels, ids = shown(found)
+        labels &= large
+        switches.add(found, labels)
+        qualities.append(panoptic(found, labels, ids).quality)
         pixels += found
-    score = panoptic(pixels, counted)
+        all_labels |= labels
+        all_ids |= ids
+    score = panoptic(pixels, all_labels, all_ids)
     defined = [quality for quality in qualities if quality is not None]
     errors = {} if T_alignment is None else plane_errors(planes, score.matches, truth.planes(), T_alignment)
     return {

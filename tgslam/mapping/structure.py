@@ -37,7 +37,7 @@ class StructureTerms:
         planes_w: [P, 4] unit normal and offset in m by plane id, world; a row of zeros is no plane. ids: [P] the id
         under which each lives on after merges (mostly its own; its row of planes_w is then that one's), -1 = removed.
         """
-        self._planes = runtime.to_device(planes_w)
+        self._planes = runtime.to_device(planes_w) if len(planes_w) else None
         self._codes = runtime.to_device(code_table(ids, self.config))
 
     def due(self, keyframe: Keyframe) -> InstanceTarget | None:
@@ -56,7 +56,7 @@ class StructureTerms:
 
     def regularise(self, gaussians: GaussianMap, visible: np.ndarray, gradient: MapGradient) -> None:
         """Add the gradient of E_str."""
-        if self.config.lambda_str > 0.0 and self._planes.shape[0]:
+        if self.config.lambda_str > 0.0 and self._planes is not None:
             self._regularisers.add(gaussians, visible, self._planes, gradient)
 
     def move_embeddings(

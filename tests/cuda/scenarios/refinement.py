@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from tests.cuda.harness import scenario
-from tgslam.config.schema import LossConfig, MappingConfig, SyntheticConfig
+from tgslam.config.schema import LossConfig, MappingConfig, StructureConfig, SyntheticConfig
 from tgslam.datasets.synthetic import SyntheticSource
 from tgslam.gaussian_map import PARAMETERS, GaussianMap
 from tgslam.geometry import se3_exp
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.refinement import Refiner
+from tgslam.mapping.structure import StructureTerms
 from tgslam.tracking.exposure import Exposure
 from tgslam.types import Camera, Frame, Gaussians
 
@@ -39,16 +40,35 @@ def _facing(frame: Frame, camera: Camera) -> Gaussians:
     )
 
 
+def _see_planes(source: SyntheticSource, keyframe: Keyframe, gaussians: GaussianMap, terms: StructureTerms) -> None:
+    """The true planes of the first view, in the camera's frame, which is about the map's."""
+    T_wc, planes_w, camera = source.pose(0), source.planes(), source.camera
+    offsets = planes_w[:, 3] + planes_w[:, :3] @ T_wc[:3, 3]
+    terms.set_planes(np.column_stack([planes_w[:, :3] @ T_wc[:3, :3], offsets]), np.arange(len(planes_w)))
+    labels = source.labels(0)
+    keyframe.plane_ids = labels.astype(np.int16)
+    mean = gaussians.host("mean")
+    u = np.rint(camera.fx * mean[:, 0] / mean[:, 2] + camera.cx).astype(int)
+    v = np.rint(camera.fy * mean[:, 1] / mean[:, 2] + camera.cy).astype(int)
+    gaussians.write("plane_id", slice(0, gaussians.count), labels[v, u])
+
+
 @scenario
-def steps(optimizer: str = "relaxation", steps: int = 3) -> dict[str, np.ndarray]:
-    """The map, the pose, the losses and the record of the views after some steps on one keyframe."""
+def steps(optimizer: str = "relaxation", steps: int = 3, planes: bool = False) -> dict[str, np.ndarray]:
+    """The map, the pose, the losses and the record of the views after some steps on one keyframe.
+
+    planes: the keyframe and the Gaussians know theirs; the embeddings then move as well.
+    """
     source = SyntheticSource(SyntheticConfig(scene="room", width=64, height=48, frames=720), seed=0)
     frame = source.read(0)
     gaussians = GaussianMap.from_gaussians(_facing(frame, source.camera))
-    refiner = Refiner(source.camera, MappingConfig(optimizer=optimizer), LossConfig())
+    structure = StructureConfig(pgi_interval=2) if planes else None
+    refiner = Refiner(source.camera, MappingConfig(optimizer=optimizer), LossConfig(), structure=structure)
     refiner.append(gaussians.count)
     pose = se3_exp([0.002, -0.001, 0.001, 0.003, 0.002, -0.004])
     keyframe = Keyframe.from_frame(frame, pose, Exposure(1.1, 0.02), np.eye(6))
+    if refiner.structure:
+        _see_planes(source, keyframe, gaussians, refiner.structure)
     values = [refiner.step(gaussians, keyframe, move_pose=True).value for _ in range(steps)]
     return {name: gaussians.host(name).copy() for name in PARAMETERS} | {
         "pose": keyframe.T_cw,

@@ -36,13 +36,13 @@ def relaxed(count: int = 300) -> dict[str, np.ndarray]:
     """One step of embeddings; a third of the rows is hidden."""
     rng = np.random.default_rng(0)
     theta = runtime.to_device(2.0 * rng.normal(size=(count, 3)))
-    rendering, ids, depth, _ = field_scene(9, 33)
+    _, ids, depth, _ = field_scene(9, 33)
     target = instance_field.prepare(ids, runtime.to_device(depth), CONFIG)
+    visible = runtime.to_device(rng.integers(0, 3, count), np.int32)
+    gradient, curvature = 0.01 * rng.normal(size=(count, 3)), 10.0 ** rng.uniform(-3, 0, (count, 2))
     instance_field.relax(
-        count, runtime.to_device(rng.integers(0, 3, count), np.int32),
-        runtime.to_device(0.01 * rng.normal(size=(count, 3))), runtime.to_device(10.0 ** rng.uniform(-3, 0, (count, 2))),
-        target, CONFIG, theta,
-    )  # fmt: skip
+        count, visible, runtime.to_device(gradient), runtime.to_device(curvature), target, CONFIG, theta
+    )
     return {"theta": runtime.to_host(theta)}
 
 
