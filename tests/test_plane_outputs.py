@@ -196,7 +196,8 @@ def segments(path: Path) -> dict[str, np.ndarray]:
     root = ElementTree.parse(path).getroot()
     found = {}
     for line in root.iter(f"{SVG}line"):
-        assert line.attrib["class"] == "wall"
+        if line.attrib["class"] != "wall":
+            continue
         name = line.find(f"{SVG}title").text
         ends = [
             [float(line.attrib["x1"]), -float(line.attrib["y1"])],

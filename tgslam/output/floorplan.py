@@ -114,11 +114,12 @@ def _on_page(points_m: Vector, low: Vector, high: Vector) -> Vector:
 
 
 def _draw_wall(svg: ElementTree.Element, line: WallLine, low: Vector, high: Vector) -> None:
+    """A line in the plane's colour, cased in grey, since some colours are nearly white."""
     (x1, y1), (x2, y2) = _on_page(line.ends_m, low, high)
-    attributes = {"x1": x1, "y1": y1, "x2": x2, "y2": y2}
+    ends = {"x1": f"{x1:.1f}", "y1": f"{y1:.1f}", "x2": f"{x2:.1f}", "y2": f"{y2:.1f}", "stroke-linecap": "round"}
     colour = "#" + "".join(f"{round(255 * value):02x}" for value in line.plane.colour)
-    wall = ElementTree.SubElement(svg, "line", {key: f"{value:.1f}" for key, value in attributes.items()})
-    wall.attrib |= {"class": "wall", "stroke": colour, "stroke-width": "6", "stroke-linecap": "round"}
+    ElementTree.SubElement(svg, "line", {"class": "casing", **ends, "stroke": "#555555", "stroke-width": "8"})
+    wall = ElementTree.SubElement(svg, "line", {"class": "wall", **ends, "stroke": colour, "stroke-width": "6"})
     ElementTree.SubElement(wall, "title").text = f"plane {line.plane.id}, {line.plane.area_m2:.2f} m2"
 
 

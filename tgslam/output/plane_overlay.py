@@ -57,7 +57,8 @@ def _legend(planes: Sequence[Plane], height: int, scale: float) -> Bytes:
     legend = np.full((height, round(230 * scale), 3), 255, np.uint8)
     for number, plane in enumerate(planes[: height // row_px]):
         top = number * row_px
-        legend[top + 2 : top + row_px - 2, 2:row_px] = _as_bytes(plane.colour)
+        legend[top + 1 : top + row_px - 1, 1:row_px] = _BLACK
+        legend[top + 2 : top + row_px - 2, 2 : row_px - 1] = _as_bytes(plane.colour)
         text = f"{plane.id}: {plane.area_m2:.2f} m2"
         cv2.putText(legend, text, (row_px + 4, top + round(0.72 * row_px)), _FONT, scale, _BLACK, 1, cv2.LINE_AA)
     return legend
