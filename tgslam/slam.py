@@ -19,6 +19,7 @@ from tgslam.keyframes import KeyframeSelector
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.mapper import Mapper
 from tgslam.planes.cue import StructureCue
+from tgslam.planes.export import planes_of
 from tgslam.tracking.exposure import Exposure
 from tgslam.tracking.motion import ConstantVelocity
 from tgslam.tracking.result import TrackingResult
@@ -103,7 +104,9 @@ class Slam:
 
     def planes(self) -> tuple[Plane, ...]:
         """The persistent planes by id, empty when planes are not looked for."""
-        return ()
+        if not self.mapper.planes:
+            return ()
+        return planes_of(self.mapper.planes.registry)
 
     def _track(self, frame: Frame) -> TrackingResult:
         predicted = self.motion.predict(frame.timestamp_s)
