@@ -54,7 +54,7 @@ def weigh_pixel(i, j, ids: ti.template(), depth: ti.template(), edge_boost, weig
 
 
 @ti.kernel
-def weigh(
+def weigh_ids(
     ids: I2,  # [H, W] plane of each pixel, -1 = none
     depth: F2,  # [H, W] m, 0 = none
     edge_boost: ti.f32,  # at a boundary weights are 1 + this times as much
@@ -98,7 +98,7 @@ def pixel_slopes(
     g_opacity: ti.template(),
     w_embedding: ti.template(),
 ):
-    """One pixel's part of `slopes`; returns its penalty before the mean."""
+    """One pixel's part of `pgi_slopes`; returns its penalty before the mean."""
     row = ti.select(ids[i, j] + 1 < code.shape[0], ids[i, j] + 1, 0)
     wanted = ti.Vector([code[row, 0], code[row, 1], code[row, 2]])
     r = ti.Vector([embedding[i, j, 0], embedding[i, j, 1], embedding[i, j, 2]]) - opacity[i, j] * wanted
@@ -112,11 +112,11 @@ def pixel_slopes(
 
 
 @ti.kernel
-def slopes(
+def pgi_slopes(
     embedding: F3,  # [H, W, 3] rendered, Eq. 3
     opacity: F2,  # [H, W] rendered
     ids: I2,  # [H, W]
-    weight: F2,  # [H, W] from `weigh`
+    weight: F2,  # [H, W] from `weigh_ids`
     counted: F1,  # [1] pixels that count
     code: F2,  # [K, 3] see above
     scale: ti.f32,  # lambda_pgi
@@ -154,7 +154,7 @@ def slopes(
 
 
 @ti.kernel
-def relax(
+def relax_embeddings(
     count: ti.i32,
     visible: I1,  # [N] 0 = leave the Gaussian alone
     grad_theta: F2,  # [N, 3]
@@ -221,7 +221,7 @@ def read_pixel(
 
 
 @ti.kernel
-def read(
+def read_ids(
     embedding: F3,  # [H, W, 3] rendered
     opacity: F2,  # [H, W] rendered
     code: F2,  # [K, 3]
