@@ -46,7 +46,7 @@ def weigh_pixel(i, j, ids: ti.template(), depth: ti.template(), edge_boost, weig
     """w_edge of a pixel; returns 1 where it counts, else 0."""
     w = 0.0
     if depth[i, j] > 0.0:
-        w = ti.select(ids[i, j] >= 0, 1.0, weight_none)
+        w = ti.select(ids[i, j] < 0, weight_none, 1.0)
         if is_edge(i, j, ids, depth) != 0:
             w *= 1.0 + edge_boost
     weight[i, j] = w
@@ -99,7 +99,7 @@ def pixel_slopes(
     w_embedding: ti.template(),
 ):
     """One pixel's part of `pgi_slopes`; returns its penalty before the mean."""
-    row = ti.select(ids[i, j] + 1 < code.shape[0], ids[i, j] + 1, 0)
+    row = ti.select(ids[i, j] < code.shape[0] - 1, ids[i, j] + 1, 0)
     wanted = ti.Vector([code[row, 0], code[row, 1], code[row, 2]])
     r = ti.Vector([embedding[i, j, 0], embedding[i, j, 1], embedding[i, j, 2]]) - opacity[i, j] * wanted
     root = charbonnier_root(r.norm_sqr(), epsilon)
@@ -167,7 +167,7 @@ def relax_embeddings(
     """One relaxation step of sigmoid(theta), in which blending is linear: see kernels/relaxation.py."""
     for i in range(count):
         whole = curvature[i, 1] + share(floor, counted[0])
-        if visible[i] != 0 and curvature[i, 1] > 0.0:
+        if curvature[i, 1] > 0.0 and visible[i] != 0:
             for c in ti.static(range(3)):
                 colour = ti.min(ti.max(sigmoid(theta[i, c]), LOW), HIGH)
                 slope = grad_theta[i, c] / (colour * (1.0 - colour))
@@ -209,7 +209,7 @@ def read_pixel(
 ):
     """Decode a pixel; returns the row of its code. A code in whose clear radius the colour lies needs no search."""
     row, found = last, -1
-    if opacity[i, j] >= min_opacity:
+    if min_opacity <= opacity[i, j]:
         x = ti.Vector([embedding[i, j, 0], embedding[i, j, 1], embedding[i, j, 2]]) / opacity[i, j]
         if squared_distance(x, code, last) < clear_square[last]:
             found = id_of[last]
