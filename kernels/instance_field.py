@@ -46,7 +46,7 @@ def weigh_pixel(i, j, ids: ti.template(), depth: ti.template(), edge_boost, weig
     """w_edge of a pixel; returns 1 where it counts, else 0."""
     w = 0.0
     if depth[i, j] > 0.0:
-        w = ti.select(ids[i, j] >= 0, 1.0, weight_none)
+        w = ti.select(ids[i, j] < 0, weight_none, 1.0)
         if is_edge(i, j, ids, depth) != 0:
             w *= 1.0 + edge_boost
     weight[i, j] = w
@@ -54,7 +54,7 @@ def weigh_pixel(i, j, ids: ti.template(), depth: ti.template(), edge_boost, weig
 
 
 @ti.kernel
-def weigh(
+def weigh_ids(
     ids: I2,  # [H, W] plane of each pixel, -1 = none
     depth: F2,  # [H, W] m, 0 = none
     edge_boost: ti.f32,  # at a boundary weights are 1 + this times as much
@@ -98,8 +98,8 @@ def pixel_slopes(
     g_opacity: ti.template(),
     w_embedding: ti.template(),
 ):
-    """One pixel's part of `slopes`; returns its penalty before the mean."""
-    row = ti.select(ids[i, j] + 1 < code.shape[0], ids[i, j] + 1, 0)
+    """One pixel's part of `pgi_slopes`; returns its penalty before the mean."""
+    row = ti.select(ids[i, j] < code.shape[0] - 1, ids[i, j] + 1, 0)
     wanted = ti.Vector([code[row, 0], code[row, 1], code[row, 2]])
     r = ti.Vector([embedding[i, j, 0], embedding[i, j, 1], embedding[i, j, 2]]) - opacity[i, j] * wanted
     root = charbonnier_root(r.norm_sqr(), epsilon)
@@ -112,11 +112,11 @@ def pixel_slopes(
 
 
 @ti.kernel
-def slopes(
+def pgi_slopes(
     embedding: F3,  # [H, W, 3] rendered, Eq. 3
     opacity: F2,  # [H, W] rendered
     ids: I2,  # [H, W]
-    weight: F2,  # [H, W] from `weigh`
+    weight: F2,  # [H, W] from `weigh_ids`
     counted: F1,  # [1] pixels that count
     code: F2,  # [K, 3] see above
     scale: ti.f32,  # lambda_pgi
@@ -154,7 +154,7 @@ def slopes(
 
 
 @ti.kernel
-def relax(
+def relax_embeddings(
     count: ti.i32,
     visible: I1,  # [N] 0 = leave the Gaussian alone
     grad_theta: F2,  # [N, 3]
@@ -167,7 +167,7 @@ def relax(
     """One relaxation step of sigmoid(theta), in which blending is linear: see kernels/relaxation.py."""
     for i in range(count):
         whole = curvature[i, 1] + share(floor, counted[0])
-        if visible[i] != 0 and curvature[i, 1] > 0.0:
+        if curvature[i, 1] > 0.0 and visible[i] != 0:
             for c in ti.static(range(3)):
                 colour = ti.min(ti.max(sigmoid(theta[i, c]), LOW), HIGH)
                 slope = grad_theta[i, c] / (colour * (1.0 - colour))
@@ -209,7 +209,7 @@ def read_pixel(
 ):
     """Decode a pixel; returns the row of its code. A code in whose clear radius the colour lies needs no search."""
     row, found = last, -1
-    if opacity[i, j] >= min_opacity:
+    if min_opacity <= opacity[i, j]:
         x = ti.Vector([embedding[i, j, 0], embedding[i, j, 1], embedding[i, j, 2]]) / opacity[i, j]
         if squared_distance(x, code, last) < clear_square[last]:
             found = id_of[last]
@@ -221,7 +221,7 @@ def read_pixel(
 
 
 @ti.kernel
-def read(
+def read_ids(
     embedding: F3,  # [H, W, 3] rendered
     opacity: F2,  # [H, W] rendered
     code: F2,  # [K, 3]

@@ -300,7 +300,27 @@ def test_run_compiles_once_and_leaves_nothing(tmp_path: Path, monkeypatch, capsy
     assert "first tracked frame" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("benchmark", ["render", "map", "track", "run"])
+def test_ablation_reports_every_identity_and_draws_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = tmp_path / "planes.png"
+    arguments = ("--scene", "desk", "--frame", "3", "--size", "96x64", "--output", str(picture))
+    result = run_json("ablation", *arguments, "--threads", "1", "--quiet")
+    assert result["iterations"][0] == 0
+    assert set(result["curves"]) == {"colour", "scalar"}
+    for curve in result["curves"].values():
+        assert len(curve["wrong"]) == len(curve["loss"]) == len(result["iterations"])
+        assert 0.0 <= curve["wrong"][-1] < curve["wrong"][0] <= 1.0
+    assert result["planes"] > 5
+    image = cv2.imread(str(picture))
+    assert image is not None
+    assert image.shape[0] == 2 * 64
+    assert image.shape[1] % 96 == 0
+    report.print_ablation(result)
+    out = capsys.readouterr().out
+    assert "colour ids" in out
+    assert f"{result['curves']['scalar']['wrong'][-1]:.2%}" in out
+
+
+@pytest.mark.parametrize("benchmark", ["render", "map", "track", "run", "ablation"])
 def test_help(benchmark: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["bench", benchmark, "--help"])
@@ -317,6 +337,7 @@ def test_help(benchmark: str, capsys: pytest.CaptureFixture[str]) -> None:
         (["render", "--colour", "no.png", "--depth", "no.png", "--camera", "1", "1", "1", "1"], 1, "no.png"),
         (["run", "--input", "nowhere"], 2, "no such folder"),
         (["track", "--frames", "3"], 2, "START:STOP:STEP"),
+        (["ablation", "--scene", "nowhere"], 2, "there is no scene 'nowhere'"),
     ],
 )
 def test_errors_are_one_line(arguments: list[str], code: int, message: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -52,7 +52,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_run_repeats_bit_for_bit(runs: Path) -> None:
-    for name in ("trajectory.txt", "keyframes.txt", "map.ply", "map_extra.npz"):
+    for name in ("trajectory.txt", "keyframes.txt", "map.ply", "map_extra.npz", "planes.json"):
         assert (runs / "a" / name).read_bytes() == (runs / "b" / name).read_bytes()
 
 

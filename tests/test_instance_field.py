@@ -123,7 +123,7 @@ def test_relaxation_matches_the_twin():
     curvature = 10.0 ** rng.uniform(-4, 0, (n, 2))
     curvature[::7, 1] = 0.0
     moved = runtime.to_device(theta.copy())
-    kernels.relax(
+    kernels.relax_embeddings(
         n, runtime.to_device(visible, np.int32), runtime.to_device(gradient), runtime.to_device(curvature),
         runtime.to_device([50.0]), 0.8, 0.3, moved,
     )  # fmt: skip

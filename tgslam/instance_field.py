@@ -70,7 +70,7 @@ def prepare(ids: ArrayLike, depth_m: np.ndarray, config: StructureConfig) -> Ins
     height, width = require("ids", on_device, (None, None), np.int32).shape
     require("depth_m", depth_m, (height, width))
     weight, counted, partial = runtime.empty((height, width)), runtime.empty((1,)), partial_sums(1, width, height)
-    kernels.weigh(on_device, depth_m, config.edge_boost, config.weight_none, weight, partial)
+    kernels.weigh_ids(on_device, depth_m, config.edge_boost, config.weight_none, weight, partial)
     add_up(partial, counted)
     return InstanceTarget(on_device, weight, counted)
 
@@ -95,7 +95,7 @@ def pgi_loss(
     require("codes", codes, (None, 3))
     for name, image in (("opacity", opacity), ("g_opacity", g_opacity), ("target", target.weight)):
         require(name, image, (height, width))
-    kernels.slopes(
+    kernels.pgi_slopes(
         embedding, opacity, target.ids, target.weight, target.counted, codes,
         config.lambda_pgi, config.charbonnier_pgi,
         workspace.embedding, g_opacity, workspace.weight, workspace.partial,
@@ -118,7 +118,7 @@ def relax(
     grad_theta: [N, 3] and curvature: [N, 2] of the backward pass for which `InstanceGradient.weight` was the weight of
     the curvature's second column. The step does not depend on lambda_pgi.
     """
-    kernels.relax(
+    kernels.relax_embeddings(
         count, visible, grad_theta, curvature, target.counted, config.relaxation,
         _ONE_PIXEL * config.lambda_pgi, theta,
     )  # fmt: skip
@@ -148,7 +148,7 @@ def read_ids(
     height, width = require("opacity", opacity, (None, None)).shape
     require("embedding", embedding, (height, width, 3))
     result = runtime.empty((height, width), np.int32)
-    kernels.read(
+    kernels.read_ids(
         embedding, opacity, runtime.to_device(codes), runtime.to_device(ids, np.int32),
         runtime.to_device(_clear_squares(codes, margin)), margin, max(min_opacity, 1e-3), result,
     )  # fmt: skip

@@ -54,7 +54,7 @@ def measure(
     """Learn the true plane labels of a built-in scene's frame, with each identity, in a map that is fixed otherwise.
 
     size: width and height. The map has a round Gaussian at every second pixel, whose embedding is neutral at first.
-    progress: is called with each identity. Raises ConfigError for an unknown scene, IndexError for a frame beyond it.
+    progress: is called with each identity. Raises ConfigError for an unknown scene.
     """
     width, height = size
     source = SyntheticSource(SyntheticConfig(scene=scene, width=width, height=height, frames=index + 2), _SEED)

@@ -17,6 +17,7 @@ from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.sightings import Sightings
 from tgslam.mapping.structure import StructureTerms
 from tgslam.optim import Adam
+from tgslam.planes.table import PlaneTable
 from tgslam.render import ImageGradient, Rasterizer
 from tgslam.stopwatch import Stopwatch, stage
 from tgslam.types import Camera
@@ -69,6 +70,11 @@ class Refiner:
         """The map has lost the rows where the mask [N] is false."""
         self.adam.keep(mask)
         self._sightings.keep(mask)
+
+    def set_planes(self, planes: PlaneTable) -> None:
+        """The planes as they are now; without terms of structure they do not matter."""
+        if self.structure:
+            self.structure.set_planes(planes)
 
     def step(self, gaussians: GaussianMap, keyframe: Keyframe, *, move_pose: bool) -> losses.LossResult:
         """Render the map at the keyframe, and move the map (and the keyframe's pose) downhill.

@@ -14,6 +14,7 @@ from tgslam.instance_field import InstanceGradient, InstanceTarget
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.plane_regularisers import PlaneRegularisers
 from tgslam.planes.codes import code_table
+from tgslam.planes.table import PlaneTable
 from tgslam.splatting.images import RenderImages
 from tgslam.types import Camera
 
@@ -29,16 +30,12 @@ class StructureTerms:
         self._regularisers = PlaneRegularisers(config)
         self._targets: OrderedDict[int, tuple[NDArray[np.int16], InstanceTarget]] = OrderedDict()
         self._visits: dict[int, int] = {}  # by keyframe
-        self.set_planes(np.zeros((0, 4)), np.zeros(0, np.int32))
+        self.set_planes(PlaneTable.empty())
 
-    def set_planes(self, planes_w: NDArray[np.floating], ids: NDArray[np.integer]) -> None:
-        """The planes as they are now; call it when one was added, refitted, merged or removed.
-
-        planes_w: [P, 4] unit normal and offset in m by plane id, world; a row of zeros is no plane. ids: [P] the id
-        under which each lives on after merges (mostly its own; its row of planes_w is then that one's), -1 = removed.
-        """
-        self._planes = runtime.to_device(planes_w) if len(planes_w) else None
-        self._codes = runtime.to_device(code_table(ids, self.config))
+    def set_planes(self, table: PlaneTable) -> None:
+        """The planes as they are now; call it when one was added, refitted, merged or removed."""
+        self._planes = runtime.to_device(table.planes_w) if len(table) else None
+        self.codes = runtime.to_device(code_table(table.ids, self.config))
 
     def due(self, keyframe: Keyframe) -> InstanceTarget | None:
         """The keyframe's target, if E_pgi takes part in this step: embeddings converge in few, so not in each."""
@@ -51,7 +48,7 @@ class StructureTerms:
     def pgi(self, rendered: RenderImages, target: InstanceTarget, g_opacity: np.ndarray) -> InstanceGradient:
         """E_pgi at a rendering; its derivative by opacity is added to g_opacity [H, W]."""
         return instance_field.pgi_loss(
-            rendered.embedding, rendered.opacity, target, self._codes, self.config, g_opacity, self._workspace
+            rendered.embedding, rendered.opacity, target, self.codes, self.config, g_opacity, self._workspace
         )
 
     def regularise(self, gaussians: GaussianMap, visible: np.ndarray, gradient: MapGradient) -> None:

@@ -32,6 +32,11 @@ def code_table(ids: NDArray[np.integer], config: StructureConfig) -> NDArray[np.
     return codes_of(np.append(palette.NO_PLANE, ids), config)
 
 
+def initial_theta(plane_ids: NDArray[np.integer], config: StructureConfig) -> NDArray[np.float32]:
+    """Embeddings [N, 3] of new Gaussians on these planes [N], -1 = on none: they are born with the right code."""
+    return instance_field.theta_of(codes_of(plane_ids, config))
+
+
 def read_ids(
     embedding: np.ndarray, opacity: np.ndarray, known_ids: ArrayLike, config: StructureConfig
 ) -> NDArray[np.int32]:

@@ -12,6 +12,7 @@ from tgslam.geometry import se3_exp
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.refinement import Refiner
 from tgslam.mapping.structure import StructureTerms
+from tgslam.planes.table import PlaneTable
 from tgslam.tracking.exposure import Exposure
 from tgslam.types import Camera, Frame, Gaussians
 
@@ -44,7 +45,8 @@ def _see_planes(source: SyntheticSource, keyframe: Keyframe, gaussians: Gaussian
     """The true planes of the first view, in the camera's frame, which is about the map's."""
     T_wc, planes_w, camera = source.pose(0), source.planes(), source.camera
     offsets = planes_w[:, 3] + planes_w[:, :3] @ T_wc[:3, 3]
-    terms.set_planes(np.column_stack([planes_w[:, :3] @ T_wc[:3, :3], offsets]), np.arange(len(planes_w)))
+    local = np.column_stack([planes_w[:, :3] @ T_wc[:3, :3], offsets])
+    terms.set_planes(PlaneTable(local, np.arange(len(local), dtype=np.int32)))
     labels = source.labels(0)
     keyframe.plane_ids = labels.astype(np.int16)
     mean = gaussians.host("mean")
