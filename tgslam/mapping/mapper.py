@@ -82,7 +82,7 @@ class Mapper:
             return None
         pixels = self.planes.observe(self.keyframes)
         if self.refiner.structure:
-            self.refiner.structure.set_planes(*self.planes.table())
+            self.refiner.structure.set_planes(self.planes.table())
         return pixels
 
     def _insert(self, keyframe: Keyframe, planes: PlanarPixels | None) -> None:

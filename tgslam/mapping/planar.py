@@ -17,6 +17,7 @@ from tgslam.mapping.keyframe import Keyframe
 from tgslam.planes.extraction import extract_planes
 from tgslam.planes.instance import NO_ID, PlanarInstance
 from tgslam.planes.registry import PlaneRegistry
+from tgslam.planes.table import PlaneTable
 from tgslam.types import Camera
 
 _CLOSING_PX = 7  # window in which a PGI may surround a pixel
@@ -64,16 +65,9 @@ class PlanarMapping:
         keyframe.plane_ids = pixels.ids.astype(np.int16)
         return pixels
 
-    def table(self) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-        """By plane id: the plane [P, 4] as unit normal and offset in m, world, and the id [P] under which it lives on.
-
-        The row of a plane that was removed is zeros and -1.
-        """
-        ids = np.array([self.registry.resolve(i) for i in range(self.registry.id_count)], np.int32)
-        planes = np.zeros((len(ids), 4))
-        for plane_id, instance in self.instances.items():
-            planes[ids == plane_id] = *instance.normal_w, instance.offset_m
-        return planes, ids
+    def table(self) -> PlaneTable:
+        """The planes as they are now, by every id that was ever given."""
+        return PlaneTable.of(self.registry, self.registry.id_count)
 
     def seen_from(self, number: int) -> list[PlanarInstance]:
         """The PGIs that a keyframe saw."""
@@ -84,7 +78,7 @@ class PlanarMapping:
 
         All other rows follow merges, and let go of PGIs that are no more.
         """
-        plane_ids = np.append(self.table()[1], np.int32(NO_ID))[gaussians.host("plane_id")]  # -1 takes the last one
+        plane_ids = np.append(self.table().ids, np.int32(NO_ID))[gaussians.host("plane_id")]  # -1 takes the last one
         means = gaussians.host("mean")
         for plane_id, instance in self.instances.items():
             named = rows[ids == plane_id]
