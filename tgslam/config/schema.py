@@ -215,7 +215,7 @@ class StructureConfig:
     relaxation: float = setting(1.0, 0.0, 1.9)  # of embeddings; 1 = the full step
     read_margin: float = setting(0.05, 0.0, 1.0)  # ids are read where no other code is less than this farther
     read_opacity: float = setting(0.5, 0.01, 1.0)  # and rendered opacity is at least this
-    lambda_str: float = setting(0.1, 0.0, 100.0)  # what E_str weighs; 0 = no regularisers
+    lambda_str: float = setting(0.05, 0.0, 100.0)  # what E_str weighs; 0 = no regularisers
     omega_flat: float = setting(1.0, 0.0, 100.0)  # of Eq. 8, scales relative to sqrt(s1 s2)
     omega_normal: float = setting(0.3, 0.0, 100.0)  # of Eq. 9
     omega_distance: float = setting(0.1, 0.0, 100.0)  # of the distance to the plane, in sigmas
