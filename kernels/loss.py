@@ -69,10 +69,7 @@ def channel_sum(a, b, c):
 @ti.func
 def for_channels(v, part: ti.template()):
     """Values of 16 pixels, repeated for the three channels: the part-th of the three interleaved vectors."""
-    out = Lanes(0.0)
-    for k in ti.static(range(LANES)):
-        out[k] = v[(LANES * part + k) // 3]
-    return out
+    return Lanes([v[(LANES * part + k) // 3] for k in ti.static(range(LANES))])
 
 
 @ti.func

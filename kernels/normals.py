@@ -116,11 +116,12 @@ def fit_16_blocks(settings: ti.template(), blocks: ti.template(), i, block, radi
     slope = centre * (2.0 * settings[STEEPEST] / ti.min(settings[FX], settings[FY]))
     zero = Lanes(0.0)
     n, sx, sy, sxx, sxy, syy, sw, sxw, syw, sww = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
-    for y in ti.static(range(-radius, radius + 1)):
+    for y in range(-radius, radius + 1):  # not unrolled: translating the rows one by one takes longer than it gains
+        dy = ti.cast(y, ti.f32)
         row_n, row_x, row_w, row_xw = zero, zero, zero, zero
         for x in ti.static(range(-radius, radius + 1)):
             w = neighbours(blocks, i + MARGIN + y, block + 1, x)
-            like = alike(w, centre, noise + slope * float(max(abs(x), abs(y))))
+            like = alike(w, centre, noise + slope * ti.max(float(abs(x)), ti.abs(dy)))
             d = like * (w - centre)
             row_n += like
             row_x += like * float(x)
@@ -128,9 +129,9 @@ def fit_16_blocks(settings: ti.template(), blocks: ti.template(), i, block, radi
             row_xw += d * float(x)
             sxx += like * float(x * x)
             sww += d * d
-        n, sx, sy, sw = n + row_n, sx + row_x, sy + row_n * float(y), sw + row_w
-        sxy, syy = sxy + row_x * float(y), syy + row_n * float(y * y)
-        sxw, syw = sxw + row_xw, syw + row_w * float(y)
+        n, sx, sy, sw = n + row_n, sx + row_x, sy + row_n * dy, sw + row_w
+        sxy, syy = sxy + row_x * dy, syy + row_n * (dy * dy)
+        sxw, syw = sxw + row_xw, syw + row_w * dy
     u = (Lanes([float(j) for j in range(LANES)]) + ti.cast(block * LANES, ti.f32)) * 2.0 + 0.5
     v = zero + (2.0 * ti.cast(i, ti.f32) + 0.5)
     w0, wx, wy, nx, ny, nz = plane_fit(

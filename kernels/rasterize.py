@@ -211,21 +211,22 @@ def forward(
 @ti.func
 def chunk_of(image: ti.template(), x0, y0):
     """The pixels of a chunk of an [H, W] image; the image's last column and row go on beyond it."""
-    lanes = Lanes(0.0)
-    for j in ti.static(range(LANES)):
-        y, x = ti.min(y0 + j // CHUNK, image.shape[0] - 1), ti.min(x0 + j % CHUNK, image.shape[1] - 1)
-        lanes[j] = image[y, x]
-    return lanes
+    bottom, right = image.shape[0] - 1, image.shape[1] - 1
+    return Lanes(
+        [image[ti.min(y0 + j // CHUNK, bottom), ti.min(x0 + j % CHUNK, right)] for j in ti.static(range(LANES))]
+    )
 
 
 @ti.func
 def chunk_of_channel(image: ti.template(), x0, y0, channel: ti.template()):
     """The same of one channel of an [H, W, 3] image."""
-    lanes = Lanes(0.0)
-    for j in ti.static(range(LANES)):
-        y, x = ti.min(y0 + j // CHUNK, image.shape[0] - 1), ti.min(x0 + j % CHUNK, image.shape[1] - 1)
-        lanes[j] = image[y, x, channel]
-    return lanes
+    bottom, right = image.shape[0] - 1, image.shape[1] - 1
+    return Lanes(
+        [
+            image[ti.min(y0 + j // CHUNK, bottom), ti.min(x0 + j % CHUNK, right), channel]
+            for j in ti.static(range(LANES))
+        ]
+    )
 
 
 @ti.func

@@ -101,10 +101,7 @@ def exp_neg(q):
 @ti.func
 def swapped(v, distance: ti.template()):
     """Lane j gets lane j ^ distance."""
-    out = Lanes(0.0)
-    for j in ti.static(range(LANES)):
-        out[j] = v[j ^ distance]
-    return out
+    return Lanes([v[j ^ distance] for j in ti.static(range(LANES))])
 
 
 @ti.func
