@@ -43,21 +43,18 @@ L3 = ti.types.ndarray(dtype=Lanes, ndim=3)
 
 ROW_SPREAD = 64  # a loop over rows counts in steps of this: Taichi hands a thread 512 iterations at a time, so 8 rows
 LANE = tuple(float(k) for k in range(LANES))
+# Where lanes come from: which of three vectors, and which of its lanes
+SHIFTED = {
+    offset: tuple(divmod(k + offset + LANES, LANES) for k in range(LANES)) for offset in range(-LANES, LANES + 1)
+}
+CHANNEL = tuple(tuple(divmod(3 * k + which, LANES) for k in range(LANES)) for which in range(3))
 LUMA_PARTS = tuple(tuple(LUMA[(LANES * part + k) % 3] for k in range(LANES)) for part in range(3))
 
 
 @ti.func
 def channel(a, b, c, which: ti.template()):
     """One channel of 16 pixels that lie interleaved in three vectors."""
-    out = Lanes(0.0)
-    for k in ti.static(range(LANES)):
-        if ti.static(3 * k + which < LANES):
-            out[k] = a[3 * k + which]
-        elif ti.static(3 * k + which < 2 * LANES):
-            out[k] = b[3 * k + which - LANES]
-        else:
-            out[k] = c[3 * k + which - 2 * LANES]
-    return out
+    return Lanes([(a, b, c)[source][k] for source, k in ti.static(CHANNEL[which])])
 
 
 @ti.func
@@ -99,15 +96,7 @@ def is_inside_row(i, height):
 @ti.func
 def shifted(left, centre, right, offset: ti.template()):
     """The 16 pixels `offset` to the right of `centre`, from it and its neighbours; |offset| <= 16."""
-    out = Lanes(0.0)
-    for k in ti.static(range(LANES)):
-        if ti.static(k + offset < 0):
-            out[k] = left[k + offset + LANES]
-        elif ti.static(k + offset >= LANES):
-            out[k] = right[k + offset - LANES]
-        else:
-            out[k] = centre[k + offset]
-    return out
+    return Lanes([(left, centre, right)[source][k] for source, k in ti.static(SHIFTED[offset])])
 
 
 @ti.func

@@ -94,17 +94,18 @@ def plane_fit(settings: ti.template(), u, v, centre, least, n, sx, sy, sxx, sxy,
     return w0, a, b, nx * scale, ny * scale, nz * scale
 
 
+def beside_lanes(x: int) -> list[tuple[int, int]]:
+    """Of each lane's neighbour x columns away: 0 = the same vector, 1 = the one beside it, and the lane there."""
+    return [(int(not 0 <= j + x < LANES), (j + x) % LANES) for j in range(LANES)]
+
+
 @ti.func
 def neighbours(blocks: ti.template(), row, block, x: ti.template()):
     """The blocks x columns beside those of a vector."""
     result = blocks[row, block]
     if ti.static(x != 0):
         here, beside = blocks[row, block], blocks[row, block + ti.static(1 if x > 0 else -1)]
-        for j in ti.static(range(LANES)):
-            if ti.static(0 <= j + x < LANES):
-                result[j] = here[(j + x) % LANES]
-            else:
-                result[j] = beside[(j + x) % LANES]
+        result = Lanes([(here, beside)[source][k] for source, k in ti.static(beside_lanes(x))])
     return result
 
 
