@@ -19,7 +19,6 @@ from tgslam.keyframes import KeyframeSelector
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.mapper import Mapper
 from tgslam.planes.cue import StructureCue
-from tgslam.planes.export import planes_of
 from tgslam.tracking.exposure import Exposure
 from tgslam.tracking.motion import ConstantVelocity
 from tgslam.tracking.result import TrackingResult
@@ -106,6 +105,10 @@ class Slam:
         """The persistent planes by id, empty when planes are not looked for."""
         if not self.mapper.planes:
             return ()
+        from tgslam.planes.export import (
+            planes_of,  # here, as `Mapper` loads the rest of planes only where they are used
+        )
+
         return planes_of(self.mapper.planes.registry)
 
     def _track(self, frame: Frame) -> TrackingResult:

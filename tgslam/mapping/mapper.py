@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +15,12 @@ from tgslam.gaussian_map import GaussianMap
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, transform_points
 from tgslam.mapping.fusion import block_centre, depth_pyramid, fused_depth, sample, turned
 from tgslam.mapping.keyframe import Keyframe
-from tgslam.mapping.planar import PlanarMapping, PlanarPixels, projected
 from tgslam.mapping.refinement import Refiner
 from tgslam.mapping.seeding import cell_sizes, quadtree, seed
 from tgslam.types import Camera
+
+if TYPE_CHECKING:
+    from tgslam.mapping.planar import PlanarMapping, PlanarPixels
 
 _NEAR_M = 0.05
 _MIN_COSINE = 0.1  # a surface more grazing than this says nothing of the depth beside
@@ -38,8 +42,7 @@ class Mapper:
         structure: StructureConfig | None = None,
     ) -> None:
         """planes, structure: how planes are found, and what they ask of the map; None = it knows nothing of planes."""
-        sigma_per_m2 = loss.depth_sigma_per_m2
-        self.planes = PlanarMapping(camera, planes, sigma_per_m2) if planes and planes.enabled else None
+        self.planes = _planar_mapping(camera, planes, loss.depth_sigma_per_m2) if planes and planes.enabled else None
         self.camera, self.config, self.seeding, self.loss, self.rng = camera, mapping, seeding, loss, rng
         self.gaussians = GaussianMap()
         self.keyframes: list[Keyframe] = []
@@ -63,8 +66,7 @@ class Mapper:
         self._fuse(keyframe, surface, kept)
         self._insert(keyframe, planes)
         if self.planes and planes:
-            rows, v, u = projected(self.gaussians, self.camera, keyframe.T_cw)
-            self.planes.label(self.gaussians, rows, planes.ids[v, u])
+            self.planes.label(self.gaussians, keyframe.T_cw, planes)
         for view in self._schedule(self.config.iterations):
             self.refiner.step(self.gaussians, view, move_pose=self._may_move(view))
         self._prune()
@@ -217,6 +219,13 @@ class Mapper:
         """The first keyframe holds the world frame; earlier ones outside the window are anchors."""
         window = self.keyframes[-self.config.window :]
         return self.config.refine_poses and keyframe is not self.keyframes[0] and any(keyframe is k for k in window)
+
+
+def _planar_mapping(camera: Camera, config: PlanesConfig, sigma_per_m2: float) -> PlanarMapping:
+    """Imported only where planes are looked for: what it needs of SciPy takes 0.3 s to load."""
+    from tgslam.mapping.planar import PlanarMapping
+
+    return PlanarMapping(camera, config, sigma_per_m2)
 
 
 class _Surface:

@@ -73,11 +73,13 @@ class PlanarMapping:
         """The PGIs that a keyframe saw."""
         return [self.instances[i] for i in self.registry.seen_from(number)]
 
-    def label(self, gaussians: GaussianMap, rows: NDArray[np.integer], ids: NDArray[np.int32]) -> None:
-        """Tie Gaussians [K] to the PGIs that a keyframe's pixels name, where they lie on them; -1 names none.
+    def label(self, gaussians: GaussianMap, T_cw: NDArray[np.float64], pixels: PlanarPixels) -> None:
+        """Tie the Gaussians in a keyframe's image to the PGIs that its pixels name, where they lie on them.
 
-        All other rows follow merges, and let go of PGIs that are no more.
+        All others follow merges, and let go of PGIs that are no more.
         """
+        rows, v, u = projected(gaussians, self.camera, T_cw)
+        ids = pixels.ids[v, u]
         plane_ids = np.append(self.table().ids, np.int32(NO_ID))[gaussians.host("plane_id")]  # -1 takes the last one
         means = gaussians.host("mean")
         for plane_id, instance in self.instances.items():

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.config.schema import PlanesConfig
-from tgslam.planes.instance import PlanarInstance
+
+if TYPE_CHECKING:
+    from tgslam.planes.instance import PlanarInstance
 
 
 class StructureCue:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.planes.instance import NO_ID
-from tgslam.planes.registry import PlaneRegistry
+
+if TYPE_CHECKING:
+    from tgslam.planes.registry import PlaneRegistry
 
 
 @dataclass(frozen=True)
