@@ -40,8 +40,8 @@ class FakeTruth:
     def planes(self) -> np.ndarray:
         return np.array([[0.0, 0, -1, 2.01], [1.0, 0, 0, 3]])
 
-    def plane_areas_m2(self) -> np.ndarray:
-        return np.array([4.0, 0.1])
+    def seen_areas_m2(self, index: int) -> np.ndarray:
+        return np.array([1.0 if index % 4 == 0 else 0.1, 0.15])
 
     def surface_distance_m(self, points_w: np.ndarray) -> np.ndarray:
         return np.abs(points_w[:, 2] - 2.0)
@@ -117,7 +117,7 @@ def test_labels_follow_the_frames_of_a_range(folder: RunFolder) -> None:
 
     truth = FrameRange(NumberedSource(12), 3, None, 2).truth()
     assert [truth.labels(i)[0, 0] for i in range(3)] == [3, 5, 7]
-    assert len(truth.planes()) == len(truth.plane_areas_m2()) == 2
+    assert len(truth.planes()) == len(truth.seen_areas_m2(0)) == 2
     assert truth.surface_distance_m(np.zeros((1, 3))) == 2
     assert FrameRange(FakeSource(12), 3).truth() is None
 

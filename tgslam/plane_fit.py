@@ -20,6 +20,8 @@ from tgslam.types import Camera
 Floats = NDArray[np.float64]
 Labels = NDArray[np.int32]
 
+FEWEST_PX = 4  # a side of a cell: with fewer, noise hides what shape it has
+
 
 @dataclass(frozen=True)
 class CellGrid:
@@ -27,6 +29,11 @@ class CellGrid:
 
     camera: Camera
     cell_px: int
+
+    @classmethod
+    def across(cls, camera: Camera, cells: int) -> CellGrid:
+        """The grid of about so many cells in a row, each of `FEWEST_PX` or more a side."""
+        return cls(camera, max(round(camera.width / cells), FEWEST_PX))
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -5,16 +5,16 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
-from collections.abc import Collection
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.config.schema import Config, StructureConfig
+from tgslam.config.schema import Config
 from tgslam.evaluation.planes import ReadIds
 from tgslam.evaluation.protocol import Render
 from tgslam.pipeline import System
-from tgslam.types import Camera, Gaussians, Matrix4
+from tgslam.types import Camera, Gaussians, Matrix4, Plane
 
 
 def add_device_option(parser: argparse.ArgumentParser) -> None:
@@ -46,16 +46,17 @@ def make_render(camera: Camera) -> Render:
     return Rasterizer(camera).render
 
 
-def make_read_ids(camera: Camera, known_ids: Collection[int], config: StructureConfig) -> ReadIds:
-    """The function that reads for `camera` which of the known planes a map shows, off its rendered embedding."""
+def make_read_ids(camera: Camera, planes: Sequence[Plane], config: Config) -> ReadIds:
+    """The function that reads for `camera` which of the planes a map shows, off its rendered embedding."""
     from tgslam.gaussian_map import GaussianMap
-    from tgslam.planes import codes
+    from tgslam.planes.reading import PlaneReader
     from tgslam.render import Rasterizer
 
-    rasterizer, known = Rasterizer(camera), np.array(sorted(known_ids), np.int64)
+    rasterizer = Rasterizer(camera)
+    reader = PlaneReader(camera, planes, config.structure, config.loss.depth_sigma_per_m2)
 
     def read(gaussians: Gaussians, T_cw: Matrix4) -> NDArray[np.int32]:
         images = rasterizer.forward(GaussianMap.from_gaussians(gaussians), T_cw, with_embedding=True)
-        return codes.read_ids(images.embedding, images.opacity, known, config)
+        return reader.read(images, T_cw)
 
     return read

@@ -49,7 +49,7 @@ def execute(args: argparse.Namespace) -> int:
         source,
         groundtruth,
         make_render=lambda: engine.make_render(record.camera),
-        make_read_ids=lambda ids: engine.make_read_ids(record.camera, ids, config.structure),
+        make_read_ids=lambda planes: engine.make_read_ids(record.camera, planes, config),
     )
     if args.groundtruth is not None and found["ate_rmse_all_cm"] is None:
         raise EvaluationError(f"{args.groundtruth}: cannot be compared with {folder.trajectory}; see the warning above")

@@ -63,7 +63,7 @@ def execute(args: argparse.Namespace) -> int:
     engine.start_device(args.device)
     render = engine.make_render(camera)
     if args.planes:
-        read_ids = engine.make_read_ids(camera, [plane.id for plane in planes], folder.read_config().structure)
+        read_ids = engine.make_read_ids(camera, planes, folder.read_config())
         _write_plane_images(output, gaussians, poses, render, read_ids, planes)
     else:
         _write_map_images(output, gaussians, poses, render)

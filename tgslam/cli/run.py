@@ -107,7 +107,7 @@ def _run_and_evaluate(
         source,
         _groundtruth(source),
         make_render=None if stop() else lambda: engine.make_render(source.camera),
-        make_read_ids=lambda ids: engine.make_read_ids(source.camera, ids, config.structure),
+        make_read_ids=lambda planes: engine.make_read_ids(source.camera, planes, config),
         stop_requested=stop,
     )
     metrics["stage_s"] |= {

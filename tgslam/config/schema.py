@@ -154,7 +154,7 @@ class PlanesConfig:
     enabled: bool = setting(False)  # False: the map knows nothing of planes
     # Segments of single views (section 3.2); sigmas are of the sensor's inverse depth at a pixel
     max_segments: int = setting(10, 1, 1000)  # K: the largest ones are kept
-    cell_px: int = setting(8, 4, 64)  # squares of pixels that segmentation starts from
+    cells_across: int = setting(80, 8, 1000)  # the image: segmentation starts from squares of at least 4 px
     cell_share: float = setting(0.5, 0.1, 1.0)  # of a cell's pixels that must be measured
     cell_sigmas: float = setting(1.4, 0.1, 100.0)  # a cell whose residual is more is not plane
     join_sigmas: float = setting(6.0, 0.1, 100.0)  # deviation of two planes under their covariances
@@ -215,6 +215,8 @@ class StructureConfig:
     relaxation: float = setting(1.0, 0.0, 1.9)  # of embeddings; 1 = the full step
     read_margin: float = setting(0.05, 0.0, 1.0)  # ids are read where no other code is less than this farther
     read_opacity: float = setting(0.5, 0.01, 1.0)  # and rendered opacity is at least this
+    read_distance_m: float = setting(0.05, 0.0, 10.0)  # and the rendered surface is at most this far from the plane
+    read_sigmas: float = setting(3.0, 0.0, 100.0)  # and so many standard deviations of the sensor's depth
     lambda_str: float = setting(0.05, 0.0, 100.0)  # what E_str weighs; 0 = no regularisers
     omega_flat: float = setting(1.0, 0.0, 100.0)  # of Eq. 8, scales relative to sqrt(s1 s2)
     omega_normal: float = setting(0.3, 0.0, 100.0)  # of Eq. 9

@@ -60,9 +60,17 @@ class SyntheticSource:
         """World planes [P, 4]: unit normal out of the solid and offset in m, n . x + d = 0."""
         return self._scene.planes_w.copy()
 
-    def plane_areas_m2(self) -> NDArray[np.float64]:
-        """[P] of the faces on `planes`, what is hidden of them included."""
-        return surfaces.plane_areas_m2(self._scene)
+    def seen_areas_m2(self, index: int) -> NDArray[np.float64]:
+        """[P] of the parts of the faces on `planes` that the frame shows."""
+        view = self._raycaster.view(self.pose(index))
+        on = view.label >= 0
+        v, u = np.nonzero(on)
+        camera = self.camera
+        rays = np.sqrt(((u - camera.cx) / camera.fx) ** 2 + ((v - camera.cy) / camera.fy) ** 2 + 1.0)
+        facing = camera.fx * camera.fy * np.maximum(view.cosine[on].astype(np.float64), 1e-6) * rays
+        pixels_m2 = view.depth_m[on].astype(np.float64) ** 2 / facing
+        areas: NDArray[np.float64] = np.bincount(view.label[on], pixels_m2, minlength=len(self._scene.planes_w))
+        return areas
 
     def surface_distance_m(self, points_w: NDArray[np.float64]) -> NDArray[np.float64]:
         """[N] from points [N, 3] m to the nearest surface, exact; inside solids too it is positive."""

@@ -18,8 +18,8 @@ class SceneTruth(Protocol):
     def planes(self) -> NDArray[np.float64]:
         """[P, 4] unit normal out of the solid, and offset in m: n . x + d = 0."""
 
-    def plane_areas_m2(self) -> NDArray[np.float64]:
-        """[P] of their faces."""
+    def seen_areas_m2(self, index: int) -> NDArray[np.float64]:
+        """[P] of the parts of their faces that frame number `index` shows."""
 
     def surface_distance_m(self, points_w: NDArray[np.float64]) -> NDArray[np.float64]:
         """[N] from points [N, 3] m to the nearest surface."""
@@ -39,9 +39,9 @@ class TruthOfFrames:
         """See `SceneTruth.planes`."""
         return self._truth.planes()
 
-    def plane_areas_m2(self) -> NDArray[np.float64]:
-        """See `SceneTruth.plane_areas_m2`."""
-        return self._truth.plane_areas_m2()
+    def seen_areas_m2(self, index: int) -> NDArray[np.float64]:
+        """See `SceneTruth.seen_areas_m2`."""
+        return self._truth.seen_areas_m2(self._indices[index])
 
     def surface_distance_m(self, points_w: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `SceneTruth.surface_distance_m`."""

@@ -54,10 +54,13 @@ def shown(pixels: Overlaps) -> tuple[frozenset[int], frozenset[int]]:
     return labels, ids
 
 
-def panoptic(pixels: Overlaps, labels: Collection[int], ids: Collection[int]) -> PanopticScore:
+def panoptic(
+    pixels: Overlaps, labels: Collection[int], ids: Collection[int], minor_ids: Collection[int] = ()
+) -> PanopticScore:
     """The score of one frame, or of the sum of several: then an instance is all its pixels of all frames.
 
-    labels, ids: the instances that count. A prediction that lies for more than half on void is no false one.
+    labels, ids: the instances that count. A prediction that lies for more than half on void is no false one; neither is
+    one of minor_ids, which are as small as the labels that do not count.
     """
     true_px: Counter[int] = Counter()
     predicted_px: Counter[int] = Counter()
@@ -75,7 +78,7 @@ def panoptic(pixels: Overlaps, labels: Collection[int], ids: Collection[int]) ->
         if label in true and id_ in ids
     }
     matched = {pair: iou for pair, iou in ious.items() if iou > _MATCH_IOU}
-    judged = {id_ for id_ in predicted_px if id_ in ids and predicted_px[id_] >= void_px[id_]}
+    judged = {id_ for id_ in predicted_px if id_ in ids and predicted_px[id_] >= void_px[id_] and id_ not in minor_ids}
     judged |= {id_ for _, id_ in matched}
     total = float(sum(matched.values()))
     return PanopticScore(

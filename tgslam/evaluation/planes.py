@@ -23,7 +23,7 @@ INSTANCE_KEYS = (
 )
 FLOATER_KEY = "floater_share"
 
-MIN_AREA_M2 = 0.2  # true planes with a smaller face are void
+MIN_AREA_M2 = 0.2  # true planes of which no frame shows more are void, smaller predicted ones no false positives
 FLOATER_M = 0.05  # from the nearest true surface
 _TAIL_PERCENT = 95.0
 
@@ -51,25 +51,30 @@ def instance_metrics(
 ) -> Metrics:
     """The values of `INSTANCE_KEYS` at `poses` (position, T_wc): the ids that the map shows against the frames' labels.
 
-    A plane counts in the frames that show enough of it, and over the sequence when there is such a frame.
+    A plane counts when a frame shows `MIN_AREA_M2` of it, in all the frames that show enough of it to speak of. An
+    estimated plane that is smaller may match, but is not held against the map when it does not.
     T_alignment: estimated world to true world, as the trajectories align; without it the errors of the planes are null.
     All are null on a request to stop.
     """
-    large = frozenset(np.flatnonzero(truth.plane_areas_m2() >= MIN_AREA_M2).tolist())
-    switches, pixels, qualities = IdentitySwitches(), Counter[tuple[int, int]](), []
-    all_labels, all_ids = set[int](), set[int]()
+    frames, areas_m2 = [], np.zeros(len(truth.planes()))
     for position, T_wc in poses:
         if stop_requested():
             return dict.fromkeys(INSTANCE_KEYS)
-        found = overlaps(truth.labels(position), read_ids(gaussians, inverse(T_wc)))
+        frames.append(overlaps(truth.labels(position), read_ids(gaussians, inverse(T_wc))))
+        areas_m2 = np.maximum(areas_m2, truth.seen_areas_m2(position))
+    large = frozenset(np.flatnonzero(areas_m2 >= MIN_AREA_M2).tolist())
+    minor = frozenset(plane.id for plane in planes if plane.area_m2 < MIN_AREA_M2)
+    switches, pixels, qualities = IdentitySwitches(), Counter[tuple[int, int]](), []
+    all_labels, all_ids = set[int](), set[int]()
+    for found in frames:
         labels, ids = shown(found)
         labels &= large
         switches.add(found, labels)
-        qualities.append(panoptic(found, labels, ids).quality)
+        qualities.append(panoptic(found, labels, ids, minor).quality)
         pixels += found
         all_labels |= labels
         all_ids |= ids
-    score = panoptic(pixels, all_labels, all_ids)
+    score = panoptic(pixels, all_labels, all_ids, minor)
     defined = [quality for quality in qualities if quality is not None]
     errors = {} if T_alignment is None else plane_errors(planes, score.matches, truth.planes(), T_alignment)
     return {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -77,7 +77,7 @@ def evaluate_run(
     source: RgbdSource | None,
     groundtruth: Trajectory | None,
     make_render: Callable[[], Render] | None,
-    make_read_ids: Callable[[Collection[int]], ReadIds] | None = None,
+    make_read_ids: Callable[[Sequence[Plane]], ReadIds] | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
     """Every metric that the files of a run and its input give: the one way for both `run` and `eval`.
@@ -139,7 +139,7 @@ def _scene_metrics(
     source: RgbdSource,
     poses: Sequence[tuple[int, Matrix4]],
     config: EvaluationConfig,
-    make_read_ids: Callable[[Collection[int]], ReadIds] | None,
+    make_read_ids: Callable[[Sequence[Plane]], ReadIds] | None,
     stop_requested: Callable[[], bool],
 ) -> dict[str, Any]:
     """What comparing with the scene itself gives; null for a recording, whose scene nobody knows."""
@@ -152,7 +152,7 @@ def _scene_metrics(
     if T_alignment is not None:
         metrics[FLOATER_KEY] = floater_share(run.gaussians, truth, T_alignment)
     if make_read_ids is not None and run.planes and poses:
-        read_ids = make_read_ids([plane.id for plane in run.planes])
+        read_ids = make_read_ids(run.planes)
         metrics |= instance_metrics(run.planes, run.gaussians, poses, truth, T_alignment, read_ids, stop_requested)
     return metrics
 

@@ -33,7 +33,7 @@ def extract_planes(depth_m: np.ndarray, camera: Camera, config: PlanesConfig, si
     in which planes are affine in the pixel, it is the same everywhere. Pixels of no plane are labelled -1. Segments
     that other views have to confirm (small, thin, grazing, rough) come with reliable=False.
     """
-    grid = CellGrid(camera, config.cell_px)
+    grid = CellGrid.across(camera, config.cells_across)
     pieces = _pieces(depth_m, grid, config, sigma_per_m2)
     if not len(pieces.moments):
         return PlaneView(np.full((camera.height, camera.width), -1, np.int32), ())
@@ -46,7 +46,7 @@ def extract_planes(depth_m: np.ndarray, camera: Camera, config: PlanesConfig, si
         sums = pixels.sums(before, _CHARBONNIER_SIGMAS * sigma_per_m2)
         planes = refined(before, sums)
     seen = _evidence(planes, planes - before, sums, grid, sigma_per_m2)
-    found = _judged(seen, noise / sigma_per_m2, camera.width * camera.height, config)
+    found = _judged(seen, noise / sigma_per_m2, grid, config)
     number = np.full(len(planes) + 1, -1, np.int32)
     number[[index for index, _ in found]] = np.arange(len(found))
     return PlaneView(number[pixels.read()], tuple(segment for _, segment in found))
@@ -85,15 +85,15 @@ def _evidence(
 
 
 def _judged(
-    candidates: Iterable[tuple[int, Evidence]], noise_sigmas: Floats, image_px: int, config: PlanesConfig
+    candidates: Iterable[tuple[int, Evidence]], noise_sigmas: Floats, grid: CellGrid, config: PlanesConfig
 ) -> list[tuple[int, PlaneSegment]]:
     """Index and segment of the largest ones that are planes. noise_sigmas: [P] the noise as the sensor's standard."""
-    found = []
+    found, image_px = [], grid.camera.width * grid.camera.height
     for index, seen in candidates:
         large = seen.segment.area_px >= config.min_area_share * image_px
         smooth = seen.segment.rms_sigmas <= config.max_rms_sigmas * noise_sigmas[index]
         if large and smooth and _bend(seen, config) <= 1.0:
-            reliable = _is_reliable(seen, image_px, config)
+            reliable = _is_reliable(seen, grid, config)
             found.append((index, dataclasses.replace(seen.segment, reliable=reliable)))
     found.sort(key=lambda item: (-item[1].area_px, item[0]))
     return found[: config.max_segments]
@@ -104,9 +104,9 @@ def _bend(seen: Evidence, config: PlanesConfig) -> float:
     return min(seen.bend_sigmas / config.max_bend_sigmas, seen.bend_m / config.max_bend_m)
 
 
-def _is_reliable(seen: Evidence, image_px: int, config: PlanesConfig) -> bool:
+def _is_reliable(seen: Evidence, grid: CellGrid, config: PlanesConfig) -> bool:
     """Whether a segment counts by itself: other views have to confirm small, thin, grazing, rough and bent ones."""
-    segment = seen.segment
+    segment, image_px = seen.segment, grid.camera.width * grid.camera.height
     turn = float(np.sqrt(np.linalg.eigvalsh(segment.covariance[:2, :2])[-1]))
     return bool(
         segment.area_px >= config.reliable_area_share * image_px
@@ -114,5 +114,5 @@ def _is_reliable(seen: Evidence, image_px: int, config: PlanesConfig) -> bool:
         and np.sqrt(segment.covariance[2, 2]) <= config.reliable_offset_m
         and seen.cosine >= config.reliable_cosine
         and _bend(seen, config) <= _RELIABLE_PART
-        and seen.width_px >= config.reliable_width_cells * config.cell_px
+        and seen.width_px >= config.reliable_width_cells * grid.cell_px
     )
