@@ -15,15 +15,15 @@ from tgslam.datasets.synthetic import SyntheticSource
 from tgslam.evaluation.images import masked_psnr
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, se3_exp, transform_points
 from tgslam.kernels import seeding as kernels
-from tgslam.mapping.seeding import Cells, cell_sizes, quadtree, seed
+from tgslam.mapping.seeding import Cells, cell_levels, cell_sizes, quadtree, seed
 from tgslam.planes import palette
 from tgslam.render import Rasterizer
 from tgslam.types import Camera, Frame, Gaussians
 
 SIGMA = 0.0015
-CONFIG = SeedingConfig()
-LARGEST = CONFIG.smallest_cell_px * 2 ** (CONFIG.cell_levels - 1)
 CAMERA = Camera(96, 72, 80.0, 80.0, 47.5, 35.5)
+LARGEST = 8  # px
+CONFIG = SeedingConfig(cells_across=CAMERA.width // LARGEST)
 
 
 def everywhere(depth_m: NDArray) -> NDArray[np.bool_]:
@@ -111,9 +111,10 @@ def test_cells_on_a_plane_grow_larger_and_ignore_a_trend_and_small_gaps() -> Non
     depth_m = np.full(v.shape, 2.0, np.float32)
     colour = np.repeat((0.2 + 0.004 * u)[..., None], 3, -1).astype(np.float32)
     ids = np.where(u < 64, 3, -1).astype(np.int32)
-    config = SeedingConfig(smallest_cell_px=2, cell_levels=3, plane_cell_levels=5)
+    config = SeedingConfig(smallest_cell_px=2, cells_across=16, plane_cells_across=4)
     sizes = cell_sizes(colour, depth_m, config, SIGMA, ids)
-    assert (sizes[:, :32] == 32).all()  # the plane, whose colour is plain but for its trend
+    assert (sizes[:, :16] == 32).all()  # the plane, whose colour is plain but for its trend
+    assert (sizes[:, 16:32] == 16).all()  # a large cell has no small ones beside it
     assert (sizes[:, 32:] < 16).all()  # elsewhere as without planes
     wanted = np.zeros(v.shape, bool)
     wanted[:32, :20], wanted[40:42, 10:12] = True, True  # most of a large cell; a crumb
@@ -121,6 +122,29 @@ def test_cells_on_a_plane_grow_larger_and_ignore_a_trend_and_small_gaps() -> Non
     assert cells.size_px.tolist() == [32.0]
     without = quadtree(colour, depth_m, wanted, config, SIGMA)
     assert without.size_px.max() <= 8 and len(without.u) > 10
+
+
+@pytest.mark.parametrize(("width_px", "plain_px", "plane_px"), [(64, 2, 2), (320, 4, 8), (640, 8, 16), (1200, 16, 32)])
+def test_the_largest_cells_cover_the_same_angle_in_images_of_every_size(width_px, plain_px, plane_px) -> None:
+    config = SeedingConfig(smallest_cell_px=2, cells_across=80, plane_cells_across=40)
+    assert 2 ** cell_levels(config, width_px) == plain_px
+    assert 2 ** cell_levels(config, width_px, on_planes=True) == plane_px
+
+
+def test_large_cells_on_a_plane_keep_away_from_its_edges_and_texture() -> None:
+    depth_m = np.full((128, 128), 2.0, np.float32)
+    colour = np.full((128, 128, 3), 0.5, np.float32)
+    colour[60:62, 60:62] = 0.9
+    ids = np.zeros(depth_m.shape, np.int32)
+    ids[:, 96:] = -1
+    config = SeedingConfig(smallest_cell_px=2, cells_across=32, plane_cells_across=8)  # up to 4 and 16 px
+    sizes = np.repeat(np.repeat(cell_sizes(colour, depth_m, config, SIGMA, ids), 2, 0), 2, 1)
+    for y, x in np.argwhere(sizes == 16)[::7]:
+        y, x = y // 16 * 16, x // 16 * 16
+        around = sizes[max(y - 8, 0) : y + 24, max(x - 8, 0) : x + 24]
+        assert around.min() >= 8
+    assert (sizes[:32, :64] == 16).all() and (sizes[60:62, 60:62] == 2).all()
+    assert (sizes[:, 84:96] <= 8).all() and (sizes[:, 96:] == 4).all()
 
 
 def test_gaussians_on_a_plane_know_it() -> None:
@@ -140,7 +164,8 @@ def test_gaussians_on_a_plane_know_it() -> None:
 @given(patchy_frames(), st.integers(1, 3), st.integers(1, 4))
 def test_every_pixel_with_depth_is_covered_once(frame: tuple, smallest: int, levels: int) -> None:
     colour, depth_m, _ = frame
-    config = SeedingConfig(smallest_cell_px=smallest, cell_levels=levels)
+    across = max(round(depth_m.shape[1] / (smallest << (levels - 1))), 1)
+    config = SeedingConfig(smallest_cell_px=smallest, cells_across=across)
     cells = quadtree(colour, depth_m, everywhere(depth_m), config, SIGMA)
     count = times_covered(cells, depth_m.shape)
     assert (count[depth_m > 0] == 1).all()

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam import runtime
+from tgslam.geometry import quat_wxyz_from_matrices
+from tgslam.kernels import rigid
 from tgslam.kernels import rows as kernels
 from tgslam.types import Gaussians
 
@@ -69,6 +71,13 @@ class GaussianMap:
             rows = runtime.to_host(getattr(self, name))[: self.count][mask]
             self.write(name, slice(0, kept), rows)
         self.count = kept
+
+    def move(self, motions: NDArray[np.float64]) -> None:
+        """Move each row with its birth keyframe: p_w <- motions[birth] p_w, rigid [K, 4, 4] for all K keyframes."""
+        rigid.move_rows(
+            self.count, self.birth_keyframe, runtime.to_device(quat_wxyz_from_matrices(motions[:, :3, :3])),
+            runtime.to_device(motions[:, :3].reshape(-1, 12)), self.mean, self.quat_wxyz,
+        )  # fmt: skip
 
     def gaussians(self) -> Gaussians:
         """A copy on the host."""

@@ -113,8 +113,10 @@ class SeedingConfig:
     """Gaussians from RGB-D."""
 
     smallest_cell_px: int = setting(2, 1, 64)  # cells at edges, texture and off planes
-    cell_levels: int = setting(3, 1, 6)  # of the quadtree: the largest cell is 2^(levels - 1) times the smallest
-    plane_cell_levels: int = setting(4, 1, 8)  # likewise for cells on one plane (PGI)
+    cells_across: int = setting(
+        80, 1, 10_000
+    )  # the image, about so many of the largest cells: doublings of the smallest
+    plane_cells_across: int = setting(40, 1, 10_000)  # likewise on one plane (PGI)
     plain_colour_std: float = setting(0.015, 0.0, 1.0)  # a cell whose channels vary less has no texture
     plane_colour_std: float = setting(0.015, 0.0, 1.0)  # likewise for a cell on one plane, but for a linear trend
     planar_sigmas: float = setting(2.0, 0.0, 100.0)  # a cell whose plane residual is less, in sensor sigmas, is flat

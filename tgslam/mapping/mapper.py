@@ -12,17 +12,17 @@ from tgslam import images, runtime
 from tgslam.config.schema import LossConfig, MappingConfig, PlanesConfig, SeedingConfig, StructureConfig
 from tgslam.depth import filled
 from tgslam.gaussian_map import GaussianMap
-from tgslam.geometry import inverse, matrix_from_quat_wxyz, transform_points
+from tgslam.geometry import inverse, matrix_from_quat_wxyz
 from tgslam.mapping.fusion import block_centre, depth_pyramid, fused_depth, sample, turned
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.refinement import Refiner
-from tgslam.mapping.seeding import cell_sizes, quadtree, seed
+from tgslam.mapping.seeding import cell_levels, cell_sizes, quadtree, seed
+from tgslam.mapping.surface import Surface
 from tgslam.types import Camera
 
 if TYPE_CHECKING:
     from tgslam.mapping.planar import PlanarMapping, PlanarPixels
 
-_NEAR_M = 0.05
 _MIN_COSINE = 0.1  # a surface more grazing than this says nothing of the depth beside
 _MAX_SLANT = 0.1  # nor one whose depth changes by more within a block
 _MIN_VIEWS = 3  # a Gaussian is judged invisible only after so many views
@@ -55,7 +55,7 @@ class Mapper:
     def add_keyframe(self, keyframe: Keyframe) -> None:
         """Take in a keyframe: weigh the evidence, clear what it knows better, insert, refine the window."""
         self.keyframes.append(keyframe)
-        surface = _Surface(
+        surface = Surface(
             keyframe, self.camera, self.gaussians, self.config.insert_sigmas * self.loss.depth_sigma_per_m2
         )
         self.conflict += surface.seen_through
@@ -112,7 +112,7 @@ class Mapper:
         self.support = np.concatenate([self.support, np.zeros(len(new), np.int32)])
         self.conflict = np.concatenate([self.conflict, np.zeros(len(new), np.int32)])
 
-    def _fuse(self, keyframe: Keyframe, surface: _Surface, kept: NDArray[np.bool_]) -> None:
+    def _fuse(self, keyframe: Keyframe, surface: Surface, kept: NDArray[np.bool_]) -> None:
         """Average the keyframe's depth and normals into the Gaussians that it supports."""
         use = surface.supported & kept
         rows = np.flatnonzero(use[kept])
@@ -123,7 +123,8 @@ class Mapper:
         u, v, z = surface.u[at], surface.v[at], surface.z[use]
         means, scales = self.gaussians.host("mean"), self.gaussians.host("log_scale")
         width_px = np.exp(np.sort(scales[rows], -1)[:, 1]) * self.camera.fx / (z * self.seeding.overlap)
-        measured, block_px = sample(depth_pyramid(depth_m, self.seeding.cell_levels + 1), u, v, width_px)
+        levels = cell_levels(self.seeding, self.camera.width)
+        measured, block_px = sample(depth_pyramid(depth_m, levels + 1), u, v, width_px)
         rotations = self.gaussians.host("quat_wxyz")[rows].astype(np.float64)
         normals_c = matrix_from_quat_wxyz(rotations)[:, :, 2] @ keyframe.T_cw[:3, :3].T
         centres = block_centre(u, block_px), block_centre(v, block_px)
@@ -158,7 +159,7 @@ class Mapper:
         """Standard deviation of the sensor's depth."""
         return self.loss.depth_sigma_per_m2 * depth_m**2
 
-    def _too_coarse(self, keyframe: Keyframe, surface: _Surface, planes: PlanarPixels | None) -> NDArray[np.bool_]:
+    def _too_coarse(self, keyframe: Keyframe, surface: Surface, planes: PlanarPixels | None) -> NDArray[np.bool_]:
         """[N] Gaussians on the keyframe's surface that are much larger in it than it would seed there today.
 
         They were seeded from afar. Only those well inside the image go, so that the keyframe fills all that they leave.
@@ -226,25 +227,3 @@ def _planar_mapping(camera: Camera, config: PlanesConfig, sigma_per_m2: float) -
     from tgslam.mapping.planar import PlanarMapping
 
     return PlanarMapping(camera, config, sigma_per_m2)
-
-
-class _Surface:
-    """How the map's Gaussians stand to the surface that a keyframe's sensor saw."""
-
-    def __init__(self, keyframe: Keyframe, camera: Camera, gaussians: GaussianMap, margin_per_m2: float) -> None:
-        depth_m = keyframe.depth_m()
-        # The nearest measurement around decides, so that an edge pixel off by one does not speak against a surface
-        nearest = cv2.erode(np.where(depth_m > 0, depth_m, np.inf), np.ones((3, 3)), borderValue=np.inf)
-        x = transform_points(keyframe.T_cw, gaussians.host("mean"))
-        self.z = np.maximum(x[:, 2], 1e-3)  # [N] m
-        self.exact_u = camera.fx * x[:, 0] / self.z + camera.cx  # [N] px
-        self.exact_v = camera.fy * x[:, 1] / self.z + camera.cy  # [N] px
-        u, v = np.rint(self.exact_u), np.rint(self.exact_v)
-        self.inside = (x[:, 2] > _NEAR_M) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)  # [N]
-        self.u, self.v = u[self.inside].astype(int), v[self.inside].astype(int)  # [inside] px
-        surface = np.full(len(x), np.inf)
-        surface[self.inside] = nearest[self.v, self.u]
-        self.measured = np.isfinite(surface)  # [N] there is depth where the Gaussian projects to
-        margin = margin_per_m2 * np.where(self.measured, surface, 0.0) ** 2
-        self.seen_through = self.measured & (self.z < surface - margin)  # [N]
-        self.supported = self.measured & (np.abs(self.z - surface) <= margin)  # [N]

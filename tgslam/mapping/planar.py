@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from tgslam import runtime
 from tgslam.config.schema import PlanesConfig
 from tgslam.gaussian_map import GaussianMap
-from tgslam.geometry import inverse, transform_points
+from tgslam.geometry import inverse
 from tgslam.mapping.keyframe import Keyframe
+from tgslam.mapping.surface import Projection
 from tgslam.planes.extraction import extract_planes
 from tgslam.planes.instance import NO_ID, PlanarInstance
 from tgslam.planes.registry import PlaneRegistry
@@ -78,8 +79,8 @@ class PlanarMapping:
 
         All others follow merges, and let go of PGIs that are no more.
         """
-        rows, v, u = projected(gaussians, self.camera, T_cw)
-        ids = pixels.ids[v, u]
+        seen = Projection(gaussians, self.camera, T_cw)
+        rows, ids = np.flatnonzero(seen.inside), pixels.ids[seen.v, seen.u]
         plane_ids = np.append(self.table().ids, np.int32(NO_ID))[gaussians.host("plane_id")]  # -1 takes the last one
         means = gaussians.host("mean")
         for plane_id, instance in self.instances.items():
@@ -130,14 +131,3 @@ class PlanarMapping:
         share = cv2.blur((index > 0).astype(np.float32), square.shape)
         fill = (index == 0) & (highest == lowest) & (share > _CLOSING_SHARE)
         return np.where(fill, np.append(NO_ID, known)[highest], ids).astype(np.int32)
-
-
-def projected(
-    gaussians: GaussianMap, camera: Camera, T_cw: NDArray[np.float64]
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of the Gaussians whose centre lies in the image, and the pixels (v, u) it lies in."""
-    x = transform_points(T_cw, gaussians.host("mean"))
-    z = np.maximum(x[:, 2], 1e-3)
-    u, v = np.rint(camera.fx * x[:, 0] / z + camera.cx), np.rint(camera.fy * x[:, 1] / z + camera.cy)
-    rows = np.flatnonzero((x[:, 2] > 1e-3) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height))
-    return rows, v[rows].astype(np.intp), u[rows].astype(np.intp)

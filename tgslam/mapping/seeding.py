@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,6 +52,12 @@ def cell_sizes(
     return sizes
 
 
+def cell_levels(config: SeedingConfig, width_px: int, *, on_planes: bool = False) -> int:
+    """Sizes of cells in an image of that width, each twice the one before: what counts is the angle that they cover."""
+    across = min(config.cells_across, config.plane_cells_across) if on_planes else config.cells_across
+    return 1 + max(round(math.log2(width_px / across / config.smallest_cell_px)), 0)
+
+
 def _whole_cells(
     colour: NDArray[np.floating],
     depth_m: NDArray[np.floating],
@@ -59,7 +67,8 @@ def _whole_cells(
 ) -> list[NDArray[np.int32]]:
     """By level [rows, columns] of `kernels.seeding`: the cells that one Gaussian can stand for, or that lie in such."""
     device = runtime.to_device(colour), runtime.to_device(depth_m)
-    levels = config.cell_levels if plane_ids is None else max(config.cell_levels, config.plane_cell_levels)
+    plain_levels = cell_levels(config, depth_m.shape[1])
+    levels = plain_levels if plane_ids is None else cell_levels(config, depth_m.shape[1], on_planes=True)
     rows, columns = _tiles(depth_m, config, levels)
     ids = np.full(depth_m.shape, -1, np.int32) if plane_ids is None else plane_ids
     device_ids = runtime.to_device(ids, np.int32)
@@ -68,12 +77,25 @@ def _whole_cells(
         cells = runtime.empty((rows >> level, columns >> level), np.int32)
         kernels.plain_and_planar(
             *device, device_ids, config.smallest_cell_px << level, config.plain_colour_std, config.plane_colour_std,
-            config.planar_sigmas * sigma_per_m2, level >= config.cell_levels, cells,
+            config.planar_sigmas * sigma_per_m2, level >= plain_levels, cells,
         )  # fmt: skip
         whole.append(runtime.to_host(cells))
+    for level in range(plain_levels, levels):
+        whole[level] *= _graded(whole[level - 1])
     for level in reversed(range(1, levels - 1)):
         whole[level] = np.maximum(whole[level], _spread(whole[level + 1], 2))
     return whole
+
+
+def _graded(smaller: NDArray[np.int32]) -> NDArray[np.int32]:
+    """[rows, columns] 1 where a cell, given the next smaller ones, has only whole ones of those inside and around.
+
+    A Gaussian reaches a cell's width beyond its cell. Were large cells to touch edges, walls would run on beyond their
+    corners, by which the tracker goes wrong.
+    """
+    rows, columns = smaller.shape[0] // 2, smaller.shape[1] // 2
+    whole = (smaller > 0).reshape(rows, 2, columns, 2).all((1, 3)).astype(np.uint8)
+    return cv2.erode(whole, np.ones((3, 3), np.uint8), borderValue=1).astype(np.int32)
 
 
 def _spread(cells: NDArray[np.int32], step: int) -> NDArray[np.int32]:
