@@ -94,6 +94,14 @@ class Plane:
 
 
 @dataclass(frozen=True)
+class RelativePose:
+    """What was measured of the motion from a keyframe i to a keyframe j."""
+
+    T_ji: Matrix4  # [4, 4] maps i to j
+    information: NDArray[np.float64]  # [6, 6] of its left perturbation (rotation rad, translation m), in frame j
+
+
+@dataclass(frozen=True)
 class Rendering:
     """What the map looks like from one pose, as host arrays."""
 
