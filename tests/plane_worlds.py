@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -99,7 +100,7 @@ def odometry(truth: list[np.ndarray], rng: np.random.Generator, noise: float = 1
     sigma = np.array([STEP_RAD] * 3 + [STEP_M] * 3)
     return [
         RelativePose(se3_exp(noise * sigma * rng.standard_normal(6)) @ b @ inverse(a), np.diag(sigma**-2.0))
-        for a, b in zip(truth[:-1], truth[1:], strict=True)
+        for a, b in pairwise(truth)
     ]
 
 

@@ -61,7 +61,7 @@ def test_the_error_of_a_plane_is_in_standard_deviations_and_its_jacobians_are_ri
     rng = np.random.default_rng(seed)
     T_cw, plane_w = random_pose(rng), random_plane(rng)
     seen = shifted(plane_w.transformed(T_cw), 1e-2 * rng.standard_normal(3))
-    error = _PlaneError(0, 1, seen)
+    error = _PlaneError((0, 1), seen)
     pose, landmark = gtsam.Pose3(inverse(T_cw)), gtsam.OrientedPlane3(*plane_w.normal, float(plane_w.offset_m))
 
     def at(xi: np.ndarray, turn: np.ndarray, jacobians: list[np.ndarray] | None = None) -> np.ndarray:
@@ -87,7 +87,7 @@ def test_a_plane_that_is_off_by_its_own_errors_has_their_mahalanobis_length(seed
     values = gtsam.Values()
     values.insert(0, gtsam.Pose3(inverse(T_cw)))
     values.insert(1, gtsam.OrientedPlane3(*predicted.normal, float(predicted.offset_m)))
-    found = _PlaneError(0, 1, local)(None, values, None)
+    found = _PlaneError((0, 1), local)(None, values, None)
     expected = offset @ np.linalg.solve(local.covariance, offset)
     assert_allclose(found @ found, expected, rtol=0.1)
 

@@ -114,7 +114,7 @@ class PoseGraph:
         if not self._values.exists(key):
             T_wc = self._values.atPose3(_pose(keyframe)).matrix()
             world = plane.transformed(T_wc)
-            self._insert(key, gtsam.OrientedPlane3(*world.normal, float(world.offset_m)))
+            self._insert(key, gtsam.OrientedPlane3(np.append(world.normal, world.offset_m)))
 
     def merge_planes(self, kept: int, absorbed: int) -> None:
         """Two planes turned out to be one: sightings of the one count for the other."""
@@ -160,14 +160,21 @@ class PoseGraph:
 
         Raises GraphError when the graph has no such keyframe or does not hold it.
         """
-        try:
-            joint = self._solver.covariance([_pose(i), _pose(j)])
-            T_wi, T_wj = (self._values.atPose3(_pose(k)).matrix() for k in (i, j))
-        except (RuntimeError, IndexError) as error:
-            raise GraphError(f"the graph does not say how keyframes {i} and {j} lie: {_first_line(error)}") from error
+        keys = _pose(i), _pose(j)
+        joint = self._covariance(keys)
+        T_wi, T_wj = (self._values.atPose3(key).matrix() for key in keys)
         T_ji = inverse(T_wj) @ T_wi
         jacobian = np.hstack([adjoint(T_ji), -np.eye(6)])
         return T_ji, jacobian @ joint @ jacobian.T
+
+    def _covariance(self, keys: tuple[int, int]) -> Vector:
+        """Joint covariance of two variables that the solver has."""
+        try:
+            joint = self._solver.covariance(keys)
+        except (RuntimeError, IndexError) as error:
+            names = " and ".join(f"{chr(gtsam.symbolChr(key))}{gtsam.symbolIndex(key)}" for key in keys)
+            raise GraphError(f"the pose graph does not know {names}: {_first_line(error)}") from error
+        return np.block([[joint.at(row, column) for column in keys] for row in keys])
 
     def _insert(self, key: int, value: Any) -> None:
         for values in (self._values, self._fresh_values):
@@ -231,14 +238,13 @@ class PoseGraph:
         )
 
     def _plane_factor(self, sighting: _Sighting) -> gtsam.CustomFactor:
-        keys = [_pose(sighting.keyframe), _landmark(sighting.plane_id)]
-        return gtsam.CustomFactor(
-            self._robust(gtsam.noiseModel.Unit.Create(3)), keys, _PlaneError(*keys, sighting.plane)
-        )
+        keys = _pose(sighting.keyframe), _landmark(sighting.plane_id)
+        noise = self._robust(gtsam.noiseModel.Unit.Create(3))
+        return gtsam.CustomFactor(noise, list(keys), _PlaneError(keys, sighting.plane))
 
     def _robust(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
         scale = self._config.robust_sigmas
-        estimators = {
+        estimators: dict[str, Any] = {
             "huber": gtsam.noiseModel.mEstimator.Huber,
             "cauchy": gtsam.noiseModel.mEstimator.Cauchy,
             "dcs": gtsam.noiseModel.mEstimator.DCS,
@@ -262,14 +268,17 @@ class _PlaneError:
     Nor does it take robust noise models.
     """
 
-    def __init__(self, pose: int, landmark: int, plane: PlaneEstimate) -> None:
-        self._keys = pose, landmark
+    def __init__(self, keys: tuple[int, int], plane: PlaneEstimate) -> None:
+        """keys: gtsam's, of the keyframe and of the plane."""
+        self._keys = keys
         first, second = plane.axes
         white = _root(np.linalg.inv(plane.covariance))
         self._by_normal = white @ np.stack([-second, first, -plane.centroid])  # [3, 3]
         self._by_offset = -white[:, 2]
 
-    def __call__(self, factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Vector] | None) -> Vector:
+    def __call__(
+        self, factor: gtsam.CustomFactor | None, values: gtsam.Values, jacobians: list[Vector] | None
+    ) -> Vector:
         T_wc = values.atPose3(self._keys[0]).matrix()
         plane_w = values.atOrientedPlane3(self._keys[1])
         coefficients = plane_w.planeCoefficients()
@@ -292,8 +301,8 @@ class _Solver(Protocol):
         """Take in new factors and first values of new variables; returns all values."""
         ...
 
-    def covariance(self, keys: Sequence[int]) -> Vector:
-        """Joint covariance of variables, in their order."""
+    def covariance(self, keys: Sequence[int]) -> gtsam.JointMarginal:
+        """Joint covariance of variables."""
         ...
 
 
@@ -313,8 +322,8 @@ class _Incremental:
                 break
         return self._isam.calculateEstimate()
 
-    def covariance(self, keys: Sequence[int]) -> Vector:
-        return _assembled(self._isam.jointMarginalCovariance(keys), keys)
+    def covariance(self, keys: Sequence[int]) -> gtsam.JointMarginal:
+        return self._isam.jointMarginalCovariance(list(keys))
 
 
 class _Batch:
@@ -332,8 +341,8 @@ class _Batch:
         self._values = gtsam.LevenbergMarquardtOptimizer(self._graph, self._values, params).optimize()
         return gtsam.Values(self._values)
 
-    def covariance(self, keys: Sequence[int]) -> Vector:
-        return _assembled(gtsam.Marginals(self._graph, self._values).jointMarginalCovariance(keys), keys)
+    def covariance(self, keys: Sequence[int]) -> gtsam.JointMarginal:
+        return gtsam.Marginals(self._graph, self._values).jointMarginalCovariance(list(keys))
 
 
 def bounded(information: Vector, sigma_rad: float, sigma_m: float) -> Vector:
@@ -352,12 +361,7 @@ def _landmark(plane_id: int) -> int:
     return key
 
 
-def _assembled(joint: gtsam.JointMarginal, keys: Sequence[int]) -> Vector:
-    """The covariance in the order of the keys: gtsam sorts them."""
-    return np.block([[joint.at(row, column) for column in keys] for row in keys])
-
-
-def _root(information: Vector) -> Vector:
+def _root(information: NDArray[np.floating[Any]]) -> Vector:
     """R with R^T R = information, a symmetric matrix without negative eigenvalues but maybe with zeros."""
     eigenvalues, vectors = np.linalg.eigh(information)
     return np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * vectors.T
