@@ -95,7 +95,7 @@ def surface_distances(
     limit: ti.f32,  # m: farther surfaces do not match
     partial: F2,  # [blocks, 29] out: upper triangle of A by rows, b, squares, matches
 ):
-    """Normal equations, in a left perturbation of T_ji, of the distances of points from the surface of a depth image."""
+    """Normal equations, in a left perturbation of T_ji, of the distances of points from a depth image's surface."""
     height, width = depth.shape[0], depth.shape[1]
     for block in range(partial.shape[0]):
         sums = ti.Vector([0.0] * MATCH_SUMS)

@@ -42,10 +42,10 @@ class SurfaceDistances:
 def height_moments(
     points: np.ndarray, row: np.ndarray, planes: Floats, depth_sigma_per_m2: float, model_sigma_m: float
 ) -> HeightMoments:
-    """Of device points [N, 3] m, at least one, over the planes that they are on, with Cauchy weights of the sensor's noise.
+    """Of points over the planes that they are on, with Cauchy weights of the sensor's noise.
 
-    row: device int32 [N], index into `planes`, -1 = none. planes: [P, 12] in the frame of the points: normal, d,
-    and each tangent followed by its product with the centroid.
+    points: device [N, 3] m, N > 0. row: device int32 [N], index into `planes`, -1 = none. planes: [P, 12] in the
+    frame of the points: normal, d, and each tangent followed by its product with the centroid.
     """
     require("points", points, (None, 3))
     require("row", row, (points.shape[0],), np.int32)
@@ -66,9 +66,10 @@ def surface_distances(
     model_sigma_m: float,
     limit_m: float,
 ) -> SurfaceDistances:
-    """Of device points [N, 3] m, at least one, of camera j from the surface of camera i's depth image (device [H, W] m, 0 = none).
+    """Of points of camera j from the surface that camera i's depth image shows.
 
-    A point matches the surface at the pixel that it falls on, if that is no farther than `limit_m`.
+    points: device [N, 3] m, N > 0. depth_m: device [H, W] m, 0 = none. A point matches the surface at the pixel that
+    it falls on, if that is no farther than `limit_m`.
     """
     require("points", points, (None, 3))
     require("depth_m", depth_m, (camera.height, camera.width))

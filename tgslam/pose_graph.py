@@ -24,7 +24,7 @@ from tgslam.types import RelativePose
 Vector = NDArray[np.float64]
 
 _FIXED = 1e-6  # rad and m, of the first keyframe: it holds the graph
-_LOOSE_RAD, _LOOSE_M = 10.0, 1000.0  # an odometry edge that says nothing still leaves the graph regular
+_LOOSE = np.diag([10.0**-2] * 3 + [1000.0**-2] * 3)  # rad, m: odometry that says nothing leaves the graph regular
 _ROUNDS = 5  # updates at most of one call, until nothing has to be linearised anew
 _MAX_ITERATIONS = 50  # of the batch solver
 
@@ -83,7 +83,8 @@ class PoseGraph:
     def add_keyframe(self, keyframe: int, T_cw: Vector, previous: int | None, motion: RelativePose | None) -> None:
         """A keyframe at its tracked pose [4, 4] and, but for the first one, the motion to it from a previous one.
 
-        The tracked pose need not be in the graph's present world: with a motion, the first guess is made from that.
+        The tracked pose counts for the first keyframe only: the others begin where their motion takes them. A motion's
+        information is tracking's own; what its residuals do not show is added here.
         Raises GraphError for the wrong number of motions, or for one that is no motion.
         """
         if (self._origin is None) != (motion is None or previous is None):
@@ -226,14 +227,15 @@ class PoseGraph:
         return gtsam.PriorFactorPose3(_pose(keyframe), gtsam.Pose3(inverse(T_cw)), noise)
 
     def _edge_factor(self, edge: _Edge) -> gtsam.BetweenFactorPose3:
-        information = edge.motion.information
+        motion, config = edge.motion, self._config
         if not edge.robust:
-            information = information + np.diag([_LOOSE_RAD**-2] * 3 + [_LOOSE_M**-2] * 3)
-        noise = gtsam.noiseModel.Gaussian.SqrtInformation(_root(information), False)
+            motion = motion.widened(config.odometry_sigma_rad, config.odometry_sigma_m)
+            motion = RelativePose(motion.T_ji, motion.information + _LOOSE)
+        noise = gtsam.noiseModel.Gaussian.SqrtInformation(_root(motion.information), False)
         return gtsam.BetweenFactorPose3(
             _pose(edge.i),
             _pose(edge.j),
-            gtsam.Pose3(inverse(edge.motion.T_ji)),
+            gtsam.Pose3(inverse(motion.T_ji)),
             self._robust(noise) if edge.robust else noise,
         )
 
@@ -343,12 +345,6 @@ class _Batch:
 
     def covariance(self, keys: Sequence[int]) -> gtsam.JointMarginal:
         return gtsam.Marginals(self._graph, self._values).jointMarginalCovariance(list(keys))
-
-
-def bounded(information: Vector, sigma_rad: float, sigma_m: float) -> Vector:
-    """Information [6, 6], which may be singular, of what also has independent errors of that size per axis."""
-    limit = np.diag([sigma_rad**-2] * 3 + [sigma_m**-2] * 3)
-    return limit - limit @ np.linalg.solve(information + limit, limit)
 
 
 def _pose(keyframe: int) -> int:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,7 +82,7 @@ class Registration:
         found = start
         for _ in range(self._config.icp_rounds):
             refitted = self._refitted(pairs, found.T_ji)
-            found = solve(lambda T_ji, planes=refitted: self._of_all(planes, T_ji), found.T_ji, self._config)
+            found = solve(partial(self._of_all, refitted), found.T_ji, self._config)
         return found
 
     def _refitted(self, pairs: PlanePairs, T_ji: Vector) -> PlanePairs:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from tgslam.config.schema import ClosureConfig
-from tgslam.geometry import se3_exp
+from tgslam.geometry import so3_exp
 from tgslam.planes.estimate import PlaneEstimate, difference
 from tgslam.types import RelativePose
 
@@ -102,7 +102,7 @@ def solve(linearise: Lineariser, prior_T_ji: Vector, config: ClosureConfig) -> M
         quadratic = linearise(T_ji)
         vectors, information = _measured(quadratic.A, unit)
         step = -unit * (vectors @ ((vectors.T @ (unit * quadratic.b)) / information))
-        T_ji = se3_exp(step) @ T_ji
+        T_ji = _moved(T_ji, step)
         if np.abs(step).max() < _SETTLED:
             break
     quadratic = linearise(T_ji)
@@ -115,6 +115,14 @@ def information_gain(quadratic: Quadratic, config: ClosureConfig) -> float:
     """How much it says of the motion to one who knows this to the config's limits: in nats."""
     unit = _unit(config)
     return 0.5 * float(np.linalg.slogdet(np.eye(6) + quadratic.A * unit[:, None] * unit)[1])
+
+
+def _moved(T_ji: Vector, step: Vector) -> Vector:
+    """Shifted, then turned about camera j: along a line that steps have no part in, the camera stays in its place."""
+    moved = T_ji.copy()
+    moved[:3, 3] += step[3:]
+    moved[:3] = so3_exp(step[:3]) @ moved[:3]
+    return moved
 
 
 def _measured(A: Vector, unit: Vector) -> tuple[Vector, Vector]:
