@@ -325,6 +325,7 @@ def test_graph_reports_every_size(capsys: pytest.CaptureFixture[str]) -> None:
     assert [case["keyframes"] for case in result["cases"]] == [5, 9]
     for case in result["cases"]:
         assert 0.0 < case["update_ms"]["median"] <= case["update_ms"]["max"]
+        assert case["cpu_ms"] > 0.0
         assert case["position_error_cm"] < 20.0
         assert case["peak_rss_mb"] > 10.0
     report.print_graph(result)

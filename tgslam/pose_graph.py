@@ -7,8 +7,8 @@ speak of left perturbations of T_cw and T_ji in the order (rotation, translation
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import gtsam
@@ -80,52 +80,64 @@ class PoseGraph:
         """Edges other than odometry."""
         return sum(edge.robust for edge in self._edges)
 
-    def add_keyframe(self, keyframe: int, T_cw: Vector, previous: int | None, motion: RelativePose | None) -> None:
-        """A keyframe at its tracked pose [4, 4] and, but for the first one, the motion to it from a previous one.
+    def add_first(self, keyframe: int, T_cw: Vector) -> None:
+        """The keyframe that holds the graph: it stays at its pose [4, 4]. Raises GraphError if there is one already."""
+        if self._origin is not None:
+            raise GraphError(f"keyframe {keyframe} is not the first one: that is keyframe {self._origin[0]}")
+        self._origin = (keyframe, T_cw)
+        self._fresh_factors.push_back(self._anchor())
+        self._insert(_pose(keyframe), gtsam.Pose3(inverse(T_cw)))
+        self._keyframes.append(keyframe)
 
-        The tracked pose counts for the first keyframe only: the others begin where their motion takes them. A motion's
-        information is tracking's own; what its residuals do not show is added here.
-        Raises GraphError for the wrong number of motions, or for one that is no motion.
+    def add_keyframe(self, keyframe: int, previous: int, motion: RelativePose) -> None:
+        """A keyframe and its odometry, the motion to it from a previous one.
+
+        The motion's information is tracking's own; what its residuals do not show is added here. Raises GraphError for
+        an unknown previous keyframe, or for one that is no motion.
         """
-        if (self._origin is None) != (motion is None or previous is None):
-            raise GraphError(f"keyframe {keyframe}: all keyframes but the first one need a motion from another one")
-        if motion is None or previous is None:
-            self._origin = (keyframe, T_cw)
-            self._fresh_factors.push_back(self._anchor())
-            guess = gtsam.Pose3(inverse(T_cw))
-        else:
-            self._add(_Edge(previous, keyframe, motion, robust=False))
-            guess = self._values.atPose3(_pose(previous)).compose(gtsam.Pose3(inverse(motion.T_ji)))
-        self._insert(_pose(keyframe), guess)
+        start = self._pose_of(previous)
+        self._add(_Edge(previous, keyframe, motion, robust=False))
+        self._insert(_pose(keyframe), start.compose(gtsam.Pose3(inverse(motion.T_ji))))
         self._keyframes.append(keyframe)
 
     def add_closure(self, i: int, j: int, motion: RelativePose) -> None:
         """A motion from keyframe i to j measured otherwise; its information may be singular.
 
-        Raises GraphError for one that is no motion.
+        Raises GraphError for an unknown keyframe, or for one that is no motion.
         """
+        for keyframe in (i, j):
+            self._pose_of(keyframe)
         self._add(_Edge(i, j, motion, robust=True))
 
     def add_plane_observation(self, keyframe: int, plane_id: int, plane: PlaneEstimate) -> None:
-        """A keyframe sees a plane; `plane` is that view's own, in its camera's frame."""
+        """A keyframe sees a plane; `plane` is that view's own, in its camera's frame.
+
+        Raises GraphError for an unknown keyframe, or for a plane without a sound covariance.
+        """
+        T_wc, key = self._pose_of(keyframe).matrix(), _landmark(plane_id)
+        if not (np.isfinite(plane.covariance).all() and np.linalg.eigvalsh(plane.covariance)[0] > 0.0):
+            raise GraphError(f"plane {plane_id} as keyframe {keyframe} saw it has no sound covariance")
         sighting = _Sighting(keyframe, plane_id, plane)
         self._sightings.append(sighting)
         self._fresh_factors.push_back(self._plane_factor(sighting))
-        key = _landmark(plane_id)
         if not self._values.exists(key):
-            T_wc = self._values.atPose3(_pose(keyframe)).matrix()
             world = plane.transformed(T_wc)
             self._insert(key, gtsam.OrientedPlane3(np.append(world.normal, world.offset_m)))
 
-    def merge_planes(self, kept: int, absorbed: int) -> None:
-        """Two planes turned out to be one: sightings of the one count for the other."""
-        if self._values.exists(_landmark(absorbed)) and not self._values.exists(_landmark(kept)):
-            self._values.insert(_landmark(kept), self._values.atOrientedPlane3(_landmark(absorbed)))
-        self._relabel(absorbed, kept)
+    def replace_planes(self, sightings: Mapping[int, Mapping[int, PlaneEstimate]]) -> None:
+        """All sightings anew, by keyframe and plane: for when planes have merged, split or ended.
 
-    def remove_plane(self, plane_id: int) -> None:
-        """A plane turned out not to exist; its sightings are forgotten."""
-        self._relabel(plane_id, None)
+        Planes that stay begin where they are, new ones where they are first seen. Costs as much as a first `optimise`
+        of everything.
+        """
+        kept = {plane_id for seen in sightings.values() for plane_id in seen}
+        for plane_id in {sighting.plane_id for sighting in self._sightings} - kept:
+            self._values.erase(_landmark(plane_id))
+        self._sightings = []
+        for keyframe, seen in sightings.items():
+            for plane_id, plane in seen.items():
+                self.add_plane_observation(keyframe, plane_id, plane)
+        self._rebuild()
 
     def optimise(self) -> GraphEstimate:
         """Take in what was added and solve.
@@ -159,23 +171,23 @@ class PoseGraph:
     def relative(self, i: int, j: int) -> tuple[Vector, Vector]:
         """T_ji [4, 4] between keyframes as of the last `optimise`, and the covariance [6, 6] of its left perturbation.
 
-        Raises GraphError when the graph has no such keyframe or does not hold it.
+        Raises GraphError when the graph does not have such keyframes, or not yet.
         """
+        T_wi, T_wj = (self._pose_of(keyframe).matrix() for keyframe in (i, j))
         keys = _pose(i), _pose(j)
-        joint = self._covariance(keys)
-        T_wi, T_wj = (self._values.atPose3(key).matrix() for key in keys)
-        T_ji = inverse(T_wj) @ T_wi
-        jacobian = np.hstack([adjoint(T_ji), -np.eye(6)])
-        return T_ji, jacobian @ joint @ jacobian.T
-
-    def _covariance(self, keys: tuple[int, int]) -> Vector:
-        """Joint covariance of two variables that the solver has."""
         try:
             joint = self._solver.covariance(keys)
-        except (RuntimeError, IndexError) as error:
-            names = " and ".join(f"{chr(gtsam.symbolChr(key))}{gtsam.symbolIndex(key)}" for key in keys)
-            raise GraphError(f"the pose graph does not know {names}: {_first_line(error)}") from error
-        return np.block([[joint.at(row, column) for column in keys] for row in keys])
+        except (RuntimeError, IndexError) as error:  # IndexError: not in the solver yet
+            raise GraphError(f"the graph does not hold keyframes {i} and {j}: {_first_line(error)}") from error
+        covariance = np.block([[joint.at(row, column) for column in keys] for row in keys])
+        T_ji = inverse(T_wj) @ T_wi
+        jacobian = np.hstack([adjoint(T_ji), -np.eye(6)])
+        return T_ji, jacobian @ covariance @ jacobian.T
+
+    def _pose_of(self, keyframe: int) -> gtsam.Pose3:
+        if not self._values.exists(_pose(keyframe)):
+            raise GraphError(f"the pose graph does not have keyframe {keyframe}")
+        return self._values.atPose3(_pose(keyframe))
 
     def _insert(self, key: int, value: Any) -> None:
         for values in (self._values, self._fresh_values):
@@ -185,16 +197,6 @@ class PoseGraph:
         _check(edge)
         self._edges.append(edge)
         self._fresh_factors.push_back(self._edge_factor(edge))
-
-    def _relabel(self, old: int, new: int | None) -> None:
-        """Give the sightings of a plane to another one, or to none."""
-        if not self._values.exists(_landmark(old)):
-            return
-        others = [s for s in self._sightings if s.plane_id != old]
-        moved = [replace(s, plane_id=new) for s in self._sightings if s.plane_id == old and new is not None]
-        self._sightings = others + moved
-        self._values.erase(_landmark(old))
-        self._rebuild()
 
     def _rebuild(self) -> None:
         """A new solver that is to start from the present values with all there is."""
@@ -208,6 +210,7 @@ class PoseGraph:
             self._rebuild()
             self._values = self._solver.update(self._fresh_factors, self._fresh_values)
         except RuntimeError as error:
+            self._rebuild()
             raise GraphError(f"the pose graph has no solution: {_first_line(error)}") from error
         self._fresh_factors, self._fresh_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
 

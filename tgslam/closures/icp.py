@@ -24,6 +24,7 @@ from tgslam.types import Camera, FloatImage
 
 Vector = NDArray[np.float64]
 
+_STEPS = 3  # at most of a round: matches change from step to step, so that they never settle to the last digit
 _LEAST_POINTS = 30  # of a plane, to fit it anew
 _LEAST_SHARE = 1e-3  # of the information of a plane's best known parameter that of the worst one is at least
 _BEHIND = np.array([[0.0, 0.0, -1e3]])  # m: a point that meets nothing, since arrays on a device cannot be empty
@@ -82,7 +83,7 @@ class Registration:
         found = start
         for _ in range(self._config.icp_rounds):
             refitted = self._refitted(pairs, found.T_ji)
-            found = solve(partial(self._of_all, refitted), found.T_ji, self._config)
+            found = solve(partial(self._of_all, refitted), found.T_ji, self._config, _STEPS)
         return found
 
     def _refitted(self, pairs: PlanePairs, T_ji: Vector) -> PlanePairs:

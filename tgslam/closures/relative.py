@@ -24,7 +24,7 @@ Vector = NDArray[np.float64]
 Lineariser = Callable[[Vector], "Quadratic"]
 
 _ITERATIONS = 10
-_SETTLED = 1e-7  # rad and m: a smaller step is none
+_SETTLED = 1e-5  # rad and m: a smaller step is none
 
 
 @dataclass(frozen=True)
@@ -95,10 +95,12 @@ def measure(pairs: PlanePairs, prior_T_ji: Vector, config: ClosureConfig) -> Mea
     return solve(lambda T_ji: of_planes(pairs, T_ji), prior_T_ji, config)
 
 
-def solve(linearise: Lineariser, prior_T_ji: Vector, config: ClosureConfig) -> Measurement:
+def solve(
+    linearise: Lineariser, prior_T_ji: Vector, config: ClosureConfig, iterations: int = _ITERATIONS
+) -> Measurement:
     """Gauss-Newton over the measured directions: steps have no part in the others."""
     unit, T_ji = _unit(config), prior_T_ji
-    for _ in range(_ITERATIONS):
+    for _ in range(iterations):
         quadratic = linearise(T_ji)
         vectors, information = _measured(quadratic.A, unit)
         step = -unit * (vectors @ ((vectors.T @ (unit * quadratic.b)) / information))
