@@ -320,7 +320,19 @@ def test_ablation_reports_every_identity_and_draws_them(tmp_path: Path, capsys: 
     assert f"{result['curves']['scalar']['wrong'][-1]:.2%}" in out
 
 
-@pytest.mark.parametrize("benchmark", ["render", "map", "track", "run", "ablation"])
+def test_graph_reports_every_size(capsys: pytest.CaptureFixture[str]) -> None:
+    result = run_json("graph", "--keyframes", "5", "9", "--planes", "4", "--sightings", "3", "--quiet")
+    assert [case["keyframes"] for case in result["cases"]] == [5, 9]
+    for case in result["cases"]:
+        assert 0.0 < case["update_ms"]["median"] <= case["update_ms"]["max"]
+        assert case["cpu_ms"] > 0.0
+        assert case["position_error_cm"] < 20.0
+        assert case["peak_rss_mb"] > 10.0
+    report.print_graph(result)
+    assert "update of the pose graph" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("benchmark", ["render", "map", "track", "run", "ablation", "graph"])
 def test_help(benchmark: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["bench", benchmark, "--help"])

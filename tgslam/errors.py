@@ -29,6 +29,10 @@ class TrackingError(TgslamError):
     """Tracking cannot start or cannot go on."""
 
 
+class GraphError(TgslamError):
+    """A pose graph that has no solution: something in it is not held by any measurement."""
+
+
 class OutputError(TgslamError):
     """A run folder that cannot be written, or read back."""
 

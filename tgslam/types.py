@@ -94,6 +94,20 @@ class Plane:
 
 
 @dataclass(frozen=True)
+class RelativePose:
+    """What was measured of the motion from a keyframe i to a keyframe j."""
+
+    T_ji: Matrix4  # [4, 4] maps i to j
+    information: NDArray[np.float64]  # [6, 6] of its left perturbation (rotation rad, translation m), in frame j
+
+    def widened(self, sigma_rad: float, sigma_m: float) -> RelativePose:
+        """With independent errors added about and along each axis; the information may be singular, and stays so."""
+        limit = np.diag([sigma_rad**-2] * 3 + [sigma_m**-2] * 3)
+        information = limit @ np.linalg.solve(self.information + limit, self.information)
+        return RelativePose(self.T_ji, 0.5 * (information + information.T))
+
+
+@dataclass(frozen=True)
 class Rendering:
     """What the map looks like from one pose, as host arrays."""
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.cuda.harness import GRIDS, Devices, assert_close
-from tests.cuda.scenarios import adam, images, planes, projection, relaxation
+from tests.cuda.scenarios import adam, closures, images, planes, projection, relaxation
 from tools.cudacheck.environment import Grid
 
 pytestmark = [pytest.mark.cuda_check, pytest.mark.parametrize("grid", GRIDS)]
@@ -41,6 +41,16 @@ def test_planes(devices: Devices, grid: Grid) -> None:
         np.testing.assert_allclose(cuda[name], cpu[name], atol=1e-4, err_msg=name)
     np.testing.assert_allclose(cuda["covariance"], cpu["covariance"], rtol=0.01, atol=1e-9)
     np.testing.assert_array_equal(cuda["reliable"], cpu["reliable"])
+
+
+@pytest.mark.parametrize(("points", "planes"), [(333, 3), (5, 1), (1, 2)])
+def test_sums_of_closures(devices: Devices, grid: Grid, points: int, planes: int) -> None:
+    cpu, cuda = devices.both(closures.sums, grid, points=points, planes=planes)
+    for name in ("points", "matches"):
+        np.testing.assert_array_equal(cuda[name], cpu[name])
+    for name in ("information", "moment", "A", "b", "squares"):
+        scale = abs(cpu[name]).max(initial=0.0) + 1e-30
+        np.testing.assert_allclose(cuda[name] / scale, cpu[name] / scale, atol=2e-4, err_msg=name)
 
 
 @pytest.mark.parametrize("with_embedding", [True, False])

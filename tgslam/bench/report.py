@@ -132,6 +132,24 @@ def print_ablation(result: dict[str, Any]) -> None:
     )
 
 
+def print_graph(result: dict[str, Any]) -> None:
+    """An update of each graph, and what its process took of memory."""
+    print_machine(result["machine"])
+    rows = [
+        (
+            f"{case['keyframes']:,}",
+            f"{case['planes']:,}",
+            f"{case['sightings']:,}",
+            *(f"{case['update_ms'][name]:.2f}" for name in ("mean", "median", "max")),
+            f"{case['cpu_ms']:.2f}",
+            "-" if case["peak_rss_mb"] is None else f"{case['peak_rss_mb']:.0f}",
+        )
+        for case in result["cases"]
+    ]
+    heads = ("keyframes", "planes", "seen by each", "mean, ms", "median, ms", "most, ms", "CPU, ms", "peak memory, MiB")
+    print_columns("an update of the pose graph after each keyframe", heads, rows)
+
+
 def _rates(case: dict[str, Any]) -> tuple[str, ...]:
     slot_pairs = case["pairs"] + case["pairs_skipped"]
     row = [

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 _SIZES = [(320, 240), (640, 480), (1200, 680)]
 _COUNTS = [20_000, 67_000, 200_000, 500_000]
 _SIZE, _COUNT = (640, 480), 67_000
+_KEYFRAMES = [500, 2000]
 _DEPTH_SCALE = 5000.0
 _LEAST_PX, _MOST_PX = 16, 8192
 
@@ -33,11 +34,11 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = commands.add_parser(
         "bench",
         help="measure speed",
-        description="Time the rasterizer, a mapping iteration, a tracking step or a whole run, stage by stage; or "
-        "compare ways of learning which plane is where.",
+        description="Time the rasterizer, a mapping iteration, a tracking step, the pose graph or a whole run, stage "
+        "by stage; or compare ways of learning which plane is where.",
     )
     benchmarks = parser.add_subparsers(metavar="BENCHMARK", required=True)
-    for add in (_add_render, _add_map, _add_track, _add_run, _add_ablation):
+    for add in (_add_render, _add_map, _add_track, _add_run, _add_ablation, _add_graph):
         benchmark = add(benchmarks)
         benchmark.add_argument("--json", action="store_true", help="print everything as JSON instead of tables")
         add_log_options(benchmark, default=argparse.SUPPRESS)
@@ -54,7 +55,7 @@ def execute(args: argparse.Namespace) -> int:
 
     printers = {
         "render": report.print_render, "map": report.print_map, "track": report.print_track, "run": report.print_run,
-        "ablation": report.print_ablation,
+        "ablation": report.print_ablation, "graph": report.print_graph,
     }  # fmt: skip
     printers[result["benchmark"]](result)
     return 0
@@ -146,6 +147,25 @@ def _add_ablation(benchmarks: Any) -> argparse.ArgumentParser:
     parser.add_argument("--output", type=Path, metavar="PNG", help="write what is read, and the truth, as a picture")
     _add_thread_count(parser)
     parser.set_defaults(measure=_measure_ablation)
+    return parser
+
+
+def _add_graph(benchmarks: Any) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = benchmarks.add_parser(
+        "graph",
+        help="the pose graph with planes as landmarks",
+        description="Add keyframes with sightings of planes to synthetic pose graphs, and time the update that follows "
+        "each. Every graph has a process of its own, whose peak memory is told.",
+    )
+    parser.add_argument(
+        "--keyframes", type=_positive, nargs="+", default=_KEYFRAMES, metavar="N",
+        help=f"of each graph (default: {' '.join(map(str, _KEYFRAMES))})",
+    )  # fmt: skip
+    parser.add_argument("--planes", type=_positive, default=40, metavar="N", help="of a graph (default: %(default)s)")
+    parser.add_argument(
+        "--sightings", type=_positive, default=6, metavar="N", help="planes that a keyframe sees (default: %(default)s)"
+    )
+    parser.set_defaults(measure=_measure_graph)
     return parser
 
 
@@ -314,6 +334,16 @@ def _measure_ablation(args: argparse.Namespace) -> dict[str, Any]:
         "iterations": list(ablation.ITERATIONS),
         "curves": {curve.identity: {"wrong": curve.wrong, "loss": curve.loss} for curve in found.curves},
     }
+
+
+def _measure_graph(args: argparse.Namespace) -> dict[str, Any]:
+    from tgslam.bench import graph, report
+    from tgslam.config.schema import ClosureConfig
+
+    sizes = [graph.Size(keyframes, args.planes, args.sightings) for keyframes in args.keyframes]
+    with step_progress("graph", len(sizes), error_console(), args.quiet) as step:
+        cases = graph.measure(sizes, ClosureConfig(), step)
+    return {"benchmark": "graph", "machine": report.machine(), "cases": cases}
 
 
 def _start(args: argparse.Namespace) -> int:

@@ -20,7 +20,7 @@ from tgslam.errors import DeviceError
 from tgslam.output.console import print_table
 from tgslam.types import Camera, Gaussians
 
-_DISTRIBUTIONS = ("taichi", "numpy", "opencv-python-headless", "scipy", "PyYAML", "rich", "trimesh")
+_DISTRIBUTIONS = ("taichi", "numpy", "opencv-python-headless", "scipy", "PyYAML", "rich", "trimesh", "gtsam")
 _EXTRAS = {"test": ("pytest", "hypothesis", "evo", "plyfile", "ruff", "mypy")}  # extra: modules that it brings
 
 

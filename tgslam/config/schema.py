@@ -229,6 +229,37 @@ class StructureConfig:
 
 
 @dataclass(frozen=True)
+class ClosureConfig:
+    """The pose graph over keyframes, and what planes seen again say to it (sections 3.3, 3.4)."""
+
+    enabled: bool = setting(False)  # False: keyframes stay where tracking has put them
+    formulation: str = setting("landmarks", choices=("closures", "landmarks", "both"))  # edges, planes as variables
+    solver: str = setting("incremental", choices=("incremental", "batch"))  # iSAM2, Levenberg-Marquardt
+    # A step's error beyond what tracking's residuals show
+    odometry_sigma_rad: float = setting(0.001, 1e-7, 1.0)
+    odometry_sigma_m: float = setting(0.003, 1e-7, 1.0)
+    robust: str = setting("cauchy", choices=("none", "huber", "cauchy", "dcs"))  # noise of closures and planes
+    robust_sigmas: float = setting(3.0, 0.1, 1000.0)  # beyond which an error counts less
+    relinearise: float = setting(0.01, 0.0, 1.0)  # rad and m; with solver: incremental
+    # Structure closures: which keyframes are compared, and what of it becomes an edge
+    interval: int = setting(4, 1, 1000)  # k of Table 4: at every k-th keyframe
+    min_gap: int = setting(4, 1, 100_000)  # keyframes between the two
+    max_edges: int = setting(5, 1, 100)  # of a keyframe to earlier ones
+    min_angle_rad: float = setting(0.35, 0.01, 1.57)  # between the normals of two shared planes
+    known_rad: float = setting(0.02, 1e-4, 10.0)  # directions of the motion that are measured no better than this
+    known_m: float = setting(0.05, 1e-4, 10.0)  # count as not measured
+    gate_probability: float = setting(0.99, 0.5, 1.0)  # of a right measurement to pass a chi-square test
+    # Their refinement (multi-plane ICP)
+    icp_rounds: int = setting(3, 0, 100)  # 0 = off
+    samples_px: int = setting(8, 1, 64)  # every n-th pixel and row is used
+    model_sigma_m: float = setting(0.003, 1e-5, 1.0)  # real surfaces are not quite planes
+    match_distance_m: float = setting(0.1, 0.001, 10.0)  # of points off planes; those farther apart do not match
+    min_matches: int = setting(60, 1, 1_000_000)  # of them, for their word to count
+    match_sigma_rad: float = setting(0.005, 1e-6, 1.0)  # what they have in error together, however many they are
+    match_sigma_m: float = setting(0.01, 1e-6, 1.0)
+
+
+@dataclass(frozen=True)
 class EvaluationConfig:
     """The fixed protocol: held-out frames never reach mapping, and keyframes are never held out."""
 
@@ -251,4 +282,5 @@ class Config:
     planes: PlanesConfig = dataclasses.field(default_factory=PlanesConfig)
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
     structure: StructureConfig = dataclasses.field(default_factory=StructureConfig)
+    closures: ClosureConfig = dataclasses.field(default_factory=ClosureConfig)
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)

@@ -110,17 +110,23 @@ def concatenated(first: PlaneEstimate, second: PlaneEstimate) -> PlaneEstimate:
     return PlaneEstimate(*(np.concatenate(pair) for pair in pairs))
 
 
-def deviation_sigmas(planes: PlaneEstimate, reference: PlaneEstimate) -> Vector:
-    """Mahalanobis distances [...] of planes from reference planes, compared at the planes' own centroids.
+def difference(planes: PlaneEstimate, reference: PlaneEstimate) -> tuple[Vector, Vector]:
+    """Errors [..., 3] (alpha rad, beta rad, delta m) of planes against reference planes, and their covariance.
 
-    Leading shapes broadcast. The centroid is where a plane is best known, and comparing there makes the result
-    independent of the origin: e = n_ref . c + d_ref, with the reference's covariance carried over to c.
+    Leading shapes broadcast. The turns are about the reference's axes. The shift is the height of the plane's own
+    centroid, which is where the plane is best known; comparing there makes the result independent of the origin. The
+    covariance is that of both planes, the reference's being carried over to that place.
     """
     angles = _angles(planes.normal, reference)
     error = np.concatenate([angles, reference.heights_m(planes.centroid)[..., None]], axis=-1)
     at_centroid = _to_axes(reference, reference.axes, planes.centroid)
     own = _to_axes(planes, reference.axes, planes.centroid)
-    covariance = _carried(own, planes.covariance) + _carried(at_centroid, reference.covariance)
+    return error, _carried(own, planes.covariance) + _carried(at_centroid, reference.covariance)
+
+
+def deviation_sigmas(planes: PlaneEstimate, reference: PlaneEstimate) -> Vector:
+    """Mahalanobis distances [...] of planes from reference planes: of their `difference`."""
+    error, covariance = difference(planes, reference)
     solved = np.linalg.solve(covariance, error[..., None])[..., 0]
     return np.sqrt(np.sum(error * solved, axis=-1))
 
