@@ -189,6 +189,7 @@ class PlanesConfig:
     step_sigma_rad: float = setting(0.001, 0.0, 1.0)  # of a keyframe relative to the one before
     step_sigma_m: float = setting(0.003, 0.0, 1.0)  # likewise
     model_sigma_m: float = setting(0.003, 1e-5, 1.0)  # real surfaces are not quite planes
+    bias_per_m2: float = setting(0.0007, 0.0, 1.0)  # a sensor bends surfaces at depth z by this * z^2, 1/m
     independent_views: int = setting(10, 1, 100_000)  # however many there are, they inform no more than so many
     observations: int = setting(256, 8, 100_000)  # kept of each PGI
     confirm_views: int = setting(3, 2, 1000)  # views that make an ambiguous segment a PGI

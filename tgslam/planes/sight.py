@@ -18,7 +18,7 @@ Vector = NDArray[np.float64]
 _NEAREST_M = 0.05  # places nearer to the camera's plane than this are not projected
 _GRAZING_COSINE = 0.05  # rays flatter than this say nothing of where they meet a plane
 _LEAST_THROUGH, _THROUGH_SHARE = 3, 0.1  # of the places in a gap: fewer are noise
-_STEP_M = 0.02  # between the places at which a gap is looked at
+_STEP_M = 0.01  # between the places at which a gap is looked at
 _MAX_FOOTPRINT_CELLS = 1 << 20  # a degenerate segment does not make the grid explode
 
 
