@@ -12,7 +12,7 @@ from tgslam.planes.association import gate
 from tgslam.planes.estimate import offset_sigmas, stacked
 from tgslam.planes.instance import NO_ID, PlanarInstance
 from tgslam.planes.matching import LEAST_SAMPLES, WELL, ViewMatching, adjoins, coplanar_in_views, shortest_gap
-from tgslam.planes.sight import Samples, Tolerance, gap_between
+from tgslam.planes.sight import Gap, Samples, Tolerance, gap_between
 
 _MOST = 0.5
 _TAKEN_SHARE = 0.8  # of what a view shows of a surface, that it counts to another one
@@ -31,6 +31,10 @@ class Joining:
     def part(self, a: PlanarInstance, b: PlanarInstance) -> None:
         """A view looks through between two: only where they touch they can still become one."""
         self._apart.add(frozenset((a, b)))
+
+    def parted_from(self, instance: PlanarInstance) -> list[PlanarInstance]:
+        """The instances that a view has parted from one."""
+        return [other for pair in self._apart if instance in pair for other in pair if other is not instance]
 
     def replace(self, absorbed: PlanarInstance, kept: PlanarInstance) -> None:
         """What parts one instance from others parts the one that has absorbed it from them."""
@@ -78,20 +82,20 @@ class Joining:
         """
         large, cells = _on_larger(a, b)
         longest_m = np.inf if bounding else self._config.bridge_m
-        gap = shortest_gap(large.support, cells, longest_m)
-        seen_through, in_image = False, False
-        if gap is not None and samples is not None:
-            seen_through, in_image = gap_between(samples, *gap, large.plane, self._tolerance)
-        if seen_through:
+        ways = shortest_gap(large.support, cells, longest_m)
+        gap = Gap(False, False, False)
+        if ways is not None and samples is not None:
+            gap = gap_between(samples, *ways, large.plane, self._tolerance)
+        if gap.parts(max(a.area_m2, b.area_m2), self._config):
             self.part(a, b)
             return False
         if frozenset((a, b)) in self._apart:
-            return adjoins(large.support.near(cells, 0.0))
+            return samples is not None and not gap.filled and adjoins(large.support.near(cells, 0.0))
         if bounding or adjoins(large.support.near(cells, self._config.max_gap_m)):
             return True
-        if gap is None or samples is None:
+        if ways is None or samples is None:
             return False
-        return in_image or min(a.area_m2, b.area_m2) >= self._config.bridge_area_m2
+        return gap.hidden or min(a.area_m2, b.area_m2) >= self._config.bridge_area_m2
 
     def _bounds(self, a: PlanarInstance, b: PlanarInstance, everything: Sequence[PlanarInstance]) -> bool:
         """Whether a pair, one of it large, has everything in front of it: floors, walls and ceilings have, which is

@@ -52,12 +52,18 @@ class ViewMatching:
         self._known = len(self.instances)  # those after are new in this view
         self._careful, self._lenient = self._agreements()
 
-    def give(self, segment: int, instance: PlanarInstance, keyframe: int) -> None:
-        """The segment shows the instance, which may be a new one."""
+    def give(
+        self, segment: int, instance: PlanarInstance, keyframe: int, parted: Sequence[PlanarInstance] = ()
+    ) -> None:
+        """The segment shows the instance, which may be a new one; what it shows of those parted from it is theirs."""
         if instance not in self.instances:
             self.instances.append(instance)
         self.owner[segment] = instance
-        instance.support.add(self.samples.footprint(segment, instance.support), keyframe)
+        footprint = self.samples.footprint(segment, instance.support)
+        for other in parted:
+            theirs = other.support.holds(other.support.cells_of(instance.support.centres(footprint)))
+            footprint = footprint[instance.support.holds(footprint) | ~theirs]
+        instance.support.add(footprint, keyframe)
 
     def overlapping(self, careful: bool) -> list[tuple[int, PlanarInstance]]:
         """The one-to-one assignment of what is not settled yet, segments to instances whose masks overlap: Eqs. 5 to 7.
@@ -96,24 +102,22 @@ class ViewMatching:
                 continue
             footprint = self.samples.footprint(segment, instance.support)
             beside = instance.support.near(footprint, self.config.max_gap_m)
-            if not self._joined(footprint, instance, adjoins(beside), fits_well) or self.looks_through(
-                segment, instance
-            ):
+            if not self._joined(segment, footprint, instance, fits_well) or self.is_parted(segment, instance):
                 continue
             score = float(np.mean(beside) - misfit[i])
             if score > best_score:
                 best, best_score = instance, score
         return best
 
-    def looked_through(self, segment: int) -> list[PlanarInstance]:
-        """The instances over whose extent an unmatched segment lies, but across a gap that the view looks through."""
+    def parted(self, segment: int) -> list[PlanarInstance]:
+        """The instances over whose extent an unmatched segment lies, but beyond a gap that parts it from them."""
         return [
             instance
             for instance in self.instances
             if self.pieces(instance)
             and self._coplanar(segment, self.pieces(instance))
             and instance.support.holds(self.samples.footprint(segment, instance.support)).any()
-            and self.looks_through(segment, instance)
+            and self.is_parted(segment, instance)
         ]
 
     def beyond_gap(self, segment: int, instance: PlanarInstance) -> tuple[Vector, NDArray[np.int32]]:
@@ -188,32 +192,34 @@ class ViewMatching:
         sigmas = np.maximum(deviation_sigmas(own, others), deviation_sigmas(others, own))
         return bool(np.all(sigmas <= self.config.gate_sigmas))
 
-    def looks_through(self, segment: int, instance: PlanarInstance) -> bool:
-        """Whether the view looks through the gaps between a segment and all others that show the instance, unless its
-        extent connects them: then it was taken for one with them from afar.
+    def is_parted(self, segment: int, instance: PlanarInstance) -> bool:
+        """Whether gaps part a segment from all others that show the instance, and its extent does not connect them:
+        then it was taken for one with them from afar.
         """
         pieces = self.pieces(instance)
         own = self.samples.footprint(segment, instance.support)
         for piece in pieces:
             other = self.samples.footprint(piece, instance.support)
-            if instance.support.connects(own, other) or not self._seen_through(own, other, instance):
+            ways = narrowest(instance.support, own, other)
+            if ways is None or instance.support.connects(own, other):
+                return False
+            larger_m2 = max(self.segments[segment].area_m2, self.segments[piece].area_m2)
+            if not gap_between(self.samples, *ways, instance.plane, self.tolerance).parts(larger_m2, self.config):
                 return False
         return bool(pieces)
 
-    def _seen_through(self, cells: Cells, others: Cells, instance: PlanarInstance) -> bool:
-        """Whether the view looks through the gap between cells of an instance's grid."""
-        gap = narrowest(instance.support, cells, others)
-        return gap is not None and gap_between(self.samples, *gap, instance.plane, self.tolerance)[0]
-
-    def _joined(self, footprint: Cells, instance: PlanarInstance, adjoining: bool, fits_well: bool) -> bool:
+    def _joined(self, segment: int, footprint: Cells, instance: PlanarInstance, fits_well: bool) -> bool:
         """Whether a footprint adjoins an instance or, if it fits well, has a short gap to it that is hidden; and the
-        view does not look through the gap.
+        gap does not part them.
         """
-        gap = shortest_gap(instance.support, footprint, self.config.bridge_m)
-        if gap is None:
+        adjoining = adjoins(instance.support.near(footprint, self.config.max_gap_m))
+        ways = shortest_gap(instance.support, footprint, self.config.bridge_m)
+        if ways is None:
             return adjoining
-        seen_through, in_image = gap_between(self.samples, *gap, instance.plane, self.tolerance)
-        return not seen_through and (adjoining or (fits_well and in_image))
+        gap = gap_between(self.samples, *ways, instance.plane, self.tolerance)
+        if gap.parts(max(instance.area_m2, self.segments[segment].area_m2), self.config):
+            return False
+        return adjoining or (fits_well and gap.hidden)
 
 
 def adjoins(beside: NDArray[np.bool_]) -> bool:

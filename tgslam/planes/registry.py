@@ -114,18 +114,21 @@ class PlaneRegistry:
         """Give every segment its instance; new ones for those that neither overlap nor continue one that there is."""
         for careful in (True, False):
             for segment, instance in matching.overlapping(careful):
-                matching.give(segment, instance, keyframe)
+                self._give(matching, segment, instance, keyframe)
         for segment in range(len(matching.segments)):
             if matching.owner[segment] is None:
                 found = matching.continued(segment)
                 if found is None:
                     found = PlanarInstance(matching.world(segment), self._config)
                     self._part(segment, found, matching)
-                matching.give(segment, found, keyframe)
+                self._give(matching, segment, found, keyframe)
+
+    def _give(self, matching: ViewMatching, segment: int, instance: PlanarInstance, keyframe: int) -> None:
+        matching.give(segment, instance, keyframe, self._joining.parted_from(instance))
 
     def _part(self, segment: int, new: PlanarInstance, matching: ViewMatching) -> None:
-        """Take from the instances that were thought to go on over a gap what lies beyond, if the view looks through."""
-        for instance in matching.looked_through(segment):
+        """Take from the instances that were thought to go on over a gap what lies beyond, where that parts them."""
+        for instance in matching.parted(segment):
             new.support.absorb(*matching.beyond_gap(segment, instance))
             self._joining.part(instance, new)
 
