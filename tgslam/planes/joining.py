@@ -29,7 +29,7 @@ class Joining:
         self._apart: set[frozenset[PlanarInstance]] = set()  # coplanar pairs between which a view looks through
 
     def part(self, a: PlanarInstance, b: PlanarInstance) -> None:
-        """A view looks through between two: only where they touch they can still become one."""
+        """A gap parts two instances in a view."""
         self._apart.add(frozenset((a, b)))
 
     def parted_from(self, instance: PlanarInstance) -> list[PlanarInstance]:
@@ -78,7 +78,8 @@ class Joining:
         """Whether two coplanar instances adjoin, or have a gap that is hidden or, between large surfaces, out of view.
 
         Floors, walls and ceilings go on behind things and where no view has looked, those that bound the scene however
-        far; table tops are smaller. A gap that any view has looked through parts two instances, until they touch.
+        far; table tops are smaller. A gap that has parted two in any view does so for good but where large ones touch,
+        as walls do over a door.
         """
         large, cells = _on_larger(a, b)
         longest_m = np.inf if bounding else self._config.bridge_m
@@ -90,7 +91,8 @@ class Joining:
             self.part(a, b)
             return False
         if frozenset((a, b)) in self._apart:
-            return samples is not None and not gap.filled and adjoins(large.support.near(cells, 0.0))
+            touching = adjoins(large.support.near(cells, 0.0))
+            return touching and min(a.area_m2, b.area_m2) >= self._config.across_area_m2
         if bounding or adjoins(large.support.near(cells, self._config.max_gap_m)):
             return True
         if ways is None or samples is None:

@@ -78,6 +78,10 @@ class PlaneRegistry:
         views = {i: instance.view(keyframe) for i, instance in self.instances.items() if keyframe in instance.keyframes}
         return {i: view for i, view in views.items() if view is not None}
 
+    def parted_from(self, plane_id: int) -> list[PlanarInstance]:
+        """The PGIs level with one that a gap parts from it."""
+        return [other for other in self._joining.parted_from(self.instances[plane_id]) if other.id in self.instances]
+
     def observe(
         self, view: PlaneView, depth_m: FloatImage, camera: Camera, T_cw: NDArray[np.float64], keyframe: int
     ) -> Observation:
