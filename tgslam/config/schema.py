@@ -155,13 +155,14 @@ class PlanesConfig:
 
     enabled: bool = setting(False)  # False: the map knows nothing of planes
     # Segments of single views (section 3.2); sigmas are of the sensor's inverse depth at a pixel
-    max_segments: int = setting(10, 1, 1000)  # K: the largest ones are kept
+    max_segments: int = setting(16, 1, 1000)  # K: the largest ones are kept
     cells_across: int = setting(80, 8, 1000)  # the image: segmentation starts from squares of at least 4 px
     cell_share: float = setting(0.5, 0.1, 1.0)  # of a cell's pixels that must be measured
     cell_sigmas: float = setting(1.4, 0.1, 100.0)  # a cell whose residual is more is not plane
     join_sigmas: float = setting(6.0, 0.1, 100.0)  # deviation of two planes under their covariances
     join_shift_sigmas: float = setting(1.2, 0.0, 100.0)  # and beyond: of a pixel, joining shifts planes at most so far
     join_shift_m: float = setting(0.01, 0.0, 1.0)  # likewise, of depth, on a surface without steps
+    across_area_m2: float = setting(0.5, 0.0, 1000.0)  # of the larger of two pieces that something stands before
     pixel_sigmas: float = setting(3.0, 0.5, 100.0)  # of a pixel from its plane
     min_area_share: float = setting(0.004, 0.0, 1.0)  # of the image
     max_rms_sigmas: float = setting(2.5, 0.1, 100.0)  # residual beyond which a segment is not plane
@@ -171,6 +172,7 @@ class PlanesConfig:
     reliable_width_cells: float = setting(3.5, 0.0, 1000.0)  # narrower segments may be two strips of other surfaces
     reliable_angle_rad: float = setting(0.01, 1e-5, 1.0)  # standard deviation beyond which a segment is ambiguous
     reliable_offset_m: float = setting(0.005, 1e-5, 1.0)  # likewise
+    reliable_curvature: float = setting(0.5, 1e-3, 1000.0)  # 1/m; rounder surfaces fall into strips that look plane
     reliable_cosine: float = setting(0.17, 0.0, 1.0)  # of the angle between normal and line of sight
     # Planar Gaussian Instances
     cell_m: float = setting(0.05, 0.005, 1.0)  # of the grid that holds the extent of a PGI
@@ -191,6 +193,7 @@ class PlanesConfig:
     step_sigma_rad: float = setting(0.001, 0.0, 1.0)  # of a keyframe relative to the one before
     step_sigma_m: float = setting(0.003, 0.0, 1.0)  # likewise
     model_sigma_m: float = setting(0.003, 1e-5, 1.0)  # real surfaces are not quite planes
+    bias_per_m2: float = setting(0.0007, 0.0, 1.0)  # a sensor bends surfaces at depth z by this * z^2, 1/m
     independent_views: int = setting(10, 1, 100_000)  # however many there are, they inform no more than so many
     observations: int = setting(256, 8, 100_000)  # kept of each PGI
     confirm_views: int = setting(3, 2, 1000)  # views that make an ambiguous segment a PGI

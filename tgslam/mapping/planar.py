@@ -13,6 +13,7 @@ from tgslam import runtime
 from tgslam.config.schema import PlanesConfig
 from tgslam.gaussian_map import GaussianMap
 from tgslam.geometry import inverse
+from tgslam.mapping.extents import KnownExtents
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.surface import Projection
 from tgslam.planes.extraction import extract_planes
@@ -62,7 +63,8 @@ class PlanarMapping:
         depth_m = keyframe.depth_m()
         view = extract_planes(runtime.to_device(depth_m), self.camera, self.config, self.sigma_per_m2)
         observation = self.registry.observe(view, depth_m, self.camera, keyframe.T_cw, number)
-        pixels = self._pixels(self._closed(observation.id_image(view.labels)), depth_m, keyframe.T_cw)
+        ids = self._completed(self._closed(observation.id_image(view.labels)), depth_m, keyframe.T_cw)
+        pixels = self._pixels(ids, depth_m, keyframe.T_cw)
         keyframe.plane_ids = pixels.ids.astype(np.int16)
         return pixels
 
@@ -99,6 +101,16 @@ class PlanarMapping:
                 self._T_cw[number] = T_cw.copy()
         if corrections:
             self.registry.moved(corrections)
+
+    def _completed(
+        self, ids: NDArray[np.int32], depth_m: NDArray[np.float32], T_cw: NDArray[np.float64]
+    ) -> NDArray[np.int32]:
+        """What the view's segments say, corrected by what is known of the PGIs from other views."""
+        extents = KnownExtents(self.instances, depth_m, self._rays, T_cw, self.config, self.sigma_per_m2)
+        for plane_id in np.unique(ids[ids != NO_ID]).tolist():
+            if others := self.registry.parted_from(plane_id):
+                ids = extents.divided(ids, plane_id, others)
+        return extents.completed(ids)
 
     def _pixels(
         self, ids: NDArray[np.int32], measured_m: NDArray[np.float32], T_cw: NDArray[np.float64]

@@ -13,11 +13,16 @@ from tgslam.planes.merging import Agreement, Indices
 from tgslam.planes.moments import joining_cost, planes_of, squared_residuals
 
 _SIGMAS = 4.0  # beyond which a measurement lies before or behind a plane
-_BEHIND_SHARE = 0.1  # of what is seen between two pieces, that may lie behind their plane: borders are ragged
-_SEEN_SHARE = 0.5  # between two pieces at least so much has to be measured: on their plane, or before it
+_OPEN_SAMPLES = 2  # one after the other behind the plane: a view through, and not a border's ragged pixel
+_OPEN_SHARE = 0.2  # of the ways between two pieces, that may be open: their borders need not be parallel
+_CLOSED_SHARE = 0.5  # of the ways that have to be known to be closed; without measurements nothing is known
+_SEEN_SHARE = 0.5  # of a way that is measured when it is known
+_FREE_SHARE = 0.5  # of what is measured between two pieces, not close before their plane: nothing there parts it
+_CLOSE_M = 0.15  # before a plane: a board between two fronts; what is farther off only hides part of the view
 _REACH = 1.0  # a gap may be so many times as wide as the larger piece is (root of its area)
 _LINKS = 48
-_SAMPLES = 16  # along each link
+_SAMPLES = 16  # along each link, or more where it is longer, in steps of at most a pixel
+_MOST_SAMPLES = 64
 
 
 @dataclass(frozen=True)
@@ -28,10 +33,13 @@ class Pieces:
     moments: Floats  # [G, 11] with the noise's variance
 
 
-def bridge(pieces: Pieces, depth_m: NDArray[np.float32], grid: CellGrid, agreement: Agreement) -> Pieces:
-    """Join the pieces that agree in their planes and between which nothing lies behind, those that agree best first.
+def bridge(
+    pieces: Pieces, depth_m: NDArray[np.float32], grid: CellGrid, agreement: Agreement, across_area_m2: float
+) -> Pieces:
+    """Join the pieces that agree in their planes and that no view through keeps apart, those that agree best first.
 
-    depth_m: host [H, W] m, 0 = none. The joined pieces are renumbered.
+    depth_m: host [H, W] m, 0 = none. across_area_m2: of two pieces with something else before the gap the larger one
+    has to be as large; small things that happen to be level are as likely. The joined pieces are renumbered.
     """
     labels, moments = pieces.labels.copy(), pieces.moments.copy()
     size = len(moments)
@@ -41,7 +49,9 @@ def bridge(pieces: Pieces, depth_m: NDArray[np.float32], grid: CellGrid, agreeme
     while np.isfinite(cost).any():
         a, b = (int(i) for i in np.unravel_index(np.argmin(cost), cost.shape))
         plane = planes_of(moments[None, a] + moments[None, b])[0]
-        if not _continuous(labels == a, labels == b, plane, depth_m, grid, agreement.sigma):
+        gap = _gap(labels == a, labels == b, plane, depth_m, grid, agreement.sigma)
+        large = _area_m2(moments[[a, b]], plane, grid).max() >= across_area_m2
+        if not (gap.closed and (large or gap.free)):
             cost[a, b] = np.inf
             continue
         labels[labels == b] = a
@@ -63,29 +73,57 @@ def _compare(cost: Floats, moments: Floats, piece: int, others: Indices, agreeme
     cost[tuple(pairs)] = np.where(agreement.admits(found, moments[pairs[0]], moments[pairs[1]]), found, np.inf)
 
 
-def _continuous(
+def _area_m2(moments: Floats, plane: Floats, grid: CellGrid) -> Floats:
+    """[N] of sets of points on one plane, as if each were at its centroid."""
+    camera = grid.camera
+    inverse_depth = moments[:, 6] / moments[:, 0]
+    return moments[:, 0] / (inverse_depth**3 * _offset_m(plane, grid) * camera.fx * camera.fy)
+
+
+def _offset_m(plane: Floats, grid: CellGrid) -> float:
+    """Of a plane [3] from the camera."""
+    return 1.0 / float(np.linalg.norm(plane[[1, 2, 0]] * np.array([grid.camera.fx, grid.camera.fy, 1.0])))
+
+
+@dataclass(frozen=True)
+class _Gap:
+    """What is seen between two pieces of one plane."""
+
+    closed: bool  # nothing behind the plane: they may be one surface
+    free: bool  # mostly the plane itself, or what is far before it: nothing that might part them is close to it
+
+
+def _gap(
     first: NDArray[np.bool_],
     second: NDArray[np.bool_],
     plane: Floats,
     depth_m: NDArray[np.float32],
     grid: CellGrid,
     sigma: float,
-) -> bool:
-    """Whether what is seen between two pieces (masks of cells) lets them be one surface."""
+) -> _Gap:
+    """Look along the shortest ways between two pieces (masks of cells)."""
     ends = _links(first, second)
     if not len(ends):
-        return False
-    along = np.linspace(0.0, 1.0, _SAMPLES)[:, None, None]
+        return _Gap(False, False)
+    longest_px = float(np.abs(ends[:, 1] - ends[:, 0]).max()) * grid.cell_px
+    along = np.linspace(0.0, 1.0, int(np.clip(longest_px, _SAMPLES, _MOST_SAMPLES)))[:, None, None]
     cells = ends[:, 0] + along * (ends[:, 1] - ends[:, 0])  # [S, L, 2] row, column
     inside = np.rint(cells * grid.cell_px + (grid.cell_px - 1) / 2).astype(int)
     v = np.minimum(inside[..., 0], depth_m.shape[0] - 1)
     u = np.minimum(inside[..., 1], depth_m.shape[1] - 1)
     between = ~(first | second)[v // grid.cell_px, u // grid.cell_px]
-    z = depth_m[v, u][between].astype(np.float64)
-    expected = (plane[0] + plane[1] * (u - grid.camera.cx) + plane[2] * (v - grid.camera.cy))[between]
-    seen = z > 0
-    behind = seen & (1.0 / np.where(seen, z, 1.0) < expected - _SIGMAS * sigma)
-    return bool(behind.sum() <= _BEHIND_SHARE * between.sum() and (seen & ~behind).sum() >= _SEEN_SHARE * between.sum())
+    z = depth_m[v, u].astype(np.float64)
+    seen = between & (z > 0)
+    measured = 1.0 / np.where(seen, z, 1.0)
+    expected = plane[0] + plane[1] * (u - grid.camera.cx) + plane[2] * (v - grid.camera.cy)
+    behind = seen & (measured - expected < -_SIGMAS * sigma)
+    before_m = _offset_m(plane, grid) * (1.0 - expected / measured)
+    close = seen & (measured - expected > _SIGMAS * sigma) & (before_m < _CLOSE_M)
+    opened = np.lib.stride_tricks.sliding_window_view(behind, _OPEN_SAMPLES, axis=0).all(axis=-1).any(axis=0)  # [L]
+    known = ~opened & (seen.sum(axis=0) >= _SEEN_SHARE * between.sum(axis=0))
+    closed = opened.mean() <= _OPEN_SHARE and known.mean() >= _CLOSED_SHARE
+    free = (seen & ~close).sum() >= _FREE_SHARE * seen.sum()
+    return _Gap(bool(closed), bool(free))
 
 
 def _links(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> Floats:

@@ -69,6 +69,19 @@ class PlaneEstimate:
         added = added + np.multiply.outer(np.square(sigma_m), np.diag([0.0, 0.0, 1.0]))
         return self._with_covariance(self.covariance + added)
 
+    def with_surface_error(self, areas_m2: Vector, sigma_m: float | Vector) -> PlaneEstimate:
+        """With what does not average out over the pixels of a surface: it strays from the plane by so much at the
+        centroid, and in its angles by as much over its size.
+        """
+        variance = np.broadcast_to(np.square(sigma_m), np.shape(areas_m2))
+        turn = variance / np.maximum(areas_m2, 1e-4)
+        added = np.stack([turn, turn, variance], axis=-1)[..., None] * np.eye(3)
+        return self._with_covariance(self.covariance + added)
+
+    def with_sensor_bias(self, areas_m2: Vector, per_m2: float) -> PlaneEstimate:
+        """Planes in a camera's frame, bent by the sensor: `with_surface_error` of per_m2 * z^2 at the depth z."""
+        return self.with_surface_error(areas_m2, per_m2 * self.centroid[..., 2] ** 2)
+
     def _with_covariance(self, covariance: Vector) -> PlaneEstimate:
         return PlaneEstimate(self.normal, self.offset_m, self.centroid, self.axes, covariance)
 
@@ -129,6 +142,14 @@ def deviation_sigmas(planes: PlaneEstimate, reference: PlaneEstimate) -> Vector:
     error, covariance = difference(planes, reference)
     solved = np.linalg.solve(covariance, error[..., None])[..., 0]
     return np.sqrt(np.sum(error * solved, axis=-1))
+
+
+def offset_sigmas(planes: PlaneEstimate, reference: PlaneEstimate) -> Vector:
+    """How far [...] reference planes pass by the planes' centroids, in standard deviations of both."""
+    at_centroid = _carried(_to_axes(reference, reference.axes, planes.centroid), reference.covariance)
+    variance = planes.covariance[..., 2, 2] + at_centroid[..., 2, 2]
+    distance: Vector = np.abs(reference.heights_m(planes.centroid)) / np.sqrt(variance)
+    return distance
 
 
 def fuse(planes: PlaneEstimate, independent: float = np.inf) -> PlaneEstimate:

@@ -64,7 +64,7 @@ def _pieces(depth_m: np.ndarray, grid: CellGrid, config: PlanesConfig, sigma: fl
     labels = np.full(len(grid), -1, np.int32)
     labels[graph.cell] = number[group]
     pieces = Pieces(labels.reshape(grid.shape), moments[kept])
-    return bridge(pieces, runtime.to_host(depth_m), grid, agreement)
+    return bridge(pieces, runtime.to_host(depth_m), grid, agreement, config.across_area_m2)
 
 
 def _continuous(graph: CellGraph, agreement: Agreement) -> Indices:
@@ -114,5 +114,6 @@ def _is_reliable(seen: Evidence, grid: CellGrid, config: PlanesConfig) -> bool:
         and np.sqrt(segment.covariance[2, 2]) <= config.reliable_offset_m
         and seen.cosine >= config.reliable_cosine
         and _bend(seen, config) <= _RELIABLE_PART
+        and seen.curvature <= config.reliable_curvature
         and seen.width_px >= config.reliable_width_cells * grid.cell_px
     )

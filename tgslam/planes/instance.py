@@ -37,6 +37,8 @@ class PlanarInstance:
         self.split_from: PlanarInstance | None = None
         self.unseen = 0  # keyframes since it was last seen
         self.through = 0  # keyframes, one after the other, that see through it
+        self.taken_by: PlanarInstance | None = None  # to which the latest keyframe to show it has counted it instead
+        self.taken = 0  # such keyframes, one after the other
         self._config = config
         self._views: PlaneEstimate | None = None  # [N] each in its keyframe's camera
         self._view_keyframes: NDArray[np.int64] = np.zeros(0, np.int64)
@@ -98,7 +100,7 @@ class PlanarInstance:
             np.array([rms_m]),
         )
         self.keyframes = sorted({*self.keyframes, keyframe})
-        self.unseen = self.through = 0
+        self.unseen = self.through = self.taken = 0
         self.refit(poses)
 
     def absorb(self, other: PlanarInstance, poses: Poses) -> None:
@@ -109,16 +111,15 @@ class PlanarInstance:
         cells, keyframes = other.support.cells()
         self.support.absorb(other.support.centres(cells), keyframes)
         self.refit(poses)
-        other.merged_into = self
 
     def refit(self, poses: Poses) -> None:
         """The plane that all views agree on, at the poses that their keyframes have now."""
         assert self._views is not None
         T_wc = np.stack([poses[int(k)] for k in self._view_keyframes])
-        uncertain = self._views.with_pose_error(self._config.pose_sigma_rad, self._config.pose_sigma_m)
-        world = uncertain.transformed(T_wc)
+        bent = self._views.with_sensor_bias(self._view_areas, self._config.bias_per_m2)
+        world = bent.with_pose_error(self._config.pose_sigma_rad, self._config.pose_sigma_m).transformed(T_wc)
         self.plane = fuse(world, self._config.independent_views)
-        self.latest = self._views[-1].transformed(T_wc[-1])
+        self.latest = bent[-1].transformed(T_wc[-1])
         self.support.follow(self.plane)
 
     def move(self, corrections: Poses, poses: Poses) -> None:

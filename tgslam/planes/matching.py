@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +19,14 @@ from tgslam.planes.support import Cells, Support
 Vector = NDArray[np.float64]
 
 _CONTACT_CELLS = 3  # in which two surfaces must adjoin
-_LEAST_SAMPLES = 4  # common to two masks
+_LEAST_COMMON = 4  # samples of two masks
+LEAST_SAMPLES = 12  # of a plane's extent in view, for the view to say something against it
 WELL = 0.5  # of the gate: planes agree well
 _CAREFUL_IOU = 0.15  # of masks that are matched one to one; less is for pieces, which `continued` is for
 _LENIENT_IOU = 0.5  # likewise without care
 _GAP_RATIO = 2.0  # the longest gap in sizes of the smaller surface
 _GAP_SLACK_CELLS = 2.0  # wider than at its narrowest place, a gap is not looked at
+_TOUCHING_CELLS = 1.5  # apart, cells are neighbours: then only those that touch say whether there is a gap
 _GAP_PLACES = 12  # at which a gap is looked at
 _SHARED_VIEWS = 5  # latest ones in which two instances are compared
 _DEFERRED_VARIANCE = 4.0  # factor by which an ambiguous segment is less certain than it says
@@ -44,19 +45,25 @@ class ViewMatching:
         self.samples, self.config, self.tolerance = samples, config, tolerance
         self.instances = list(instances)
         self.segments = samples.view.segments
-        self.local = _with_model_error(from_segments(self.segments), self._areas_m2(), config.model_sigma_m)
+        self.local = from_segments(self.segments).with_surface_error(self._areas_m2(), config.model_sigma_m)
         self.local.covariance[[not s.reliable for s in self.segments]] *= _DEFERRED_VARIANCE
         self.owner: list[PlanarInstance | None] = [None] * len(self.segments)
         self.sights = self._sights()
         self._known = len(self.instances)  # those after are new in this view
         self._careful, self._lenient = self._agreements()
 
-    def give(self, segment: int, instance: PlanarInstance, keyframe: int) -> None:
-        """The segment shows the instance, which may be a new one."""
+    def give(
+        self, segment: int, instance: PlanarInstance, keyframe: int, parted: Sequence[PlanarInstance] = ()
+    ) -> None:
+        """The segment shows the instance, which may be a new one; what it shows of those parted from it is theirs."""
         if instance not in self.instances:
             self.instances.append(instance)
         self.owner[segment] = instance
-        instance.support.add(self.samples.footprint(segment, instance.support), keyframe)
+        footprint = self.samples.footprint(segment, instance.support)
+        for other in parted:
+            theirs = other.support.holds(other.support.cells_of(instance.support.centres(footprint)))
+            footprint = footprint[instance.support.holds(footprint) | ~theirs]
+        instance.support.add(footprint, keyframe)
 
     def overlapping(self, careful: bool) -> list[tuple[int, PlanarInstance]]:
         """The one-to-one assignment of what is not settled yet, segments to instances whose masks overlap: Eqs. 5 to 7.
@@ -95,16 +102,32 @@ class ViewMatching:
                 continue
             footprint = self.samples.footprint(segment, instance.support)
             beside = instance.support.near(footprint, self.config.max_gap_m)
-            if not (adjoins(beside) or (fits_well and self._hidden_gap(footprint, instance))):
+            if not self._joined(segment, footprint, instance, fits_well) or self.is_parted(segment, instance):
                 continue
             score = float(np.mean(beside) - misfit[i])
             if score > best_score:
                 best, best_score = instance, score
         return best
 
+    def parted(self, segment: int) -> list[PlanarInstance]:
+        """The instances over whose extent an unmatched segment lies, but beyond a gap that parts it from them."""
+        return [
+            instance
+            for instance in self.instances
+            if self.pieces(instance)
+            and self._coplanar(segment, self.pieces(instance))
+            and instance.support.holds(self.samples.footprint(segment, instance.support)).any()
+            and self.is_parted(segment, instance)
+        ]
+
+    def beyond_gap(self, segment: int, instance: PlanarInstance) -> tuple[Vector, NDArray[np.int32]]:
+        """Take the part of an instance's extent over which a segment lies from it: `Support.take_part`."""
+        kept = [self.samples.footprint(piece, instance.support) for piece in self.pieces(instance)]
+        return instance.support.take_part(self.samples.footprint(segment, instance.support), np.concatenate(kept))
+
     def world(self, segment: int) -> PlaneEstimate:
         """A segment's plane in the world."""
-        return self.local[segment].transformed(inverse(self.samples.T_cw))
+        return self._bent()[segment].transformed(inverse(self.samples.T_cw))
 
     def pieces(self, instance: PlanarInstance) -> list[int]:
         """The segments that show an instance."""
@@ -116,6 +139,10 @@ class ViewMatching:
         rms_m = np.array([self.segments[piece].rms_m for piece in pieces])
         plane = self.local[pieces[0]] if len(pieces) == 1 else fuse(self.local[pieces])
         return plane, float(areas.sum()), float(np.sqrt(areas @ rms_m**2 / max(areas.sum(), 1e-12)))
+
+    def _bent(self) -> PlaneEstimate:
+        """The segments with what the sensor may bend them, as other views have not seen it."""
+        return self.local.with_sensor_bias(self._areas_m2(), self.config.bias_per_m2)
 
     def _areas_m2(self) -> NDArray[np.float64]:
         return np.array([segment.area_m2 for segment in self.segments], np.float64)
@@ -139,7 +166,7 @@ class ViewMatching:
         """
         config, position = self.config, self.samples.position_w
         drift = np.sqrt(1.0 + np.array([i.unseen for i in self.instances], np.float64))[None]
-        local, T_wc = self.local[:, None], inverse(self.samples.T_cw)
+        local, T_wc = self._bent()[:, None], inverse(self.samples.T_cw)
         all_views, latest = (stacked([getattr(i, name) for i in self.instances]) for name in ("plane", "latest"))
         near = local.with_pose_error(
             np.minimum(drift * config.step_sigma_rad, config.pose_sigma_rad),
@@ -155,7 +182,7 @@ class ViewMatching:
 
     def _meet(self, masks: Overlap) -> NDArray[np.bool_]:
         """[S, G]: whether masks overlap enough."""
-        return (masks.containment >= self.config.min_overlap) & (masks.intersection >= _LEAST_SAMPLES)
+        return (masks.containment >= self.config.min_overlap) & (masks.intersection >= _LEAST_COMMON)
 
     def _overlaps(self, segment: int, index: int) -> bool:
         return index in self.sights and bool(self._meet(self._overlap([index]))[segment, 0])
@@ -165,13 +192,34 @@ class ViewMatching:
         sigmas = np.maximum(deviation_sigmas(own, others), deviation_sigmas(others, own))
         return bool(np.all(sigmas <= self.config.gate_sigmas))
 
-    def _hidden_gap(self, footprint: Cells, instance: PlanarInstance) -> bool:
-        """Whether the gap between a footprint and an instance is short, and all of it is hidden in the image."""
-        gap = shortest_gap(instance.support, footprint, self.config.bridge_m)
-        if gap is None:
+    def is_parted(self, segment: int, instance: PlanarInstance) -> bool:
+        """Whether gaps part a segment from all others that show the instance, and its extent does not connect them:
+        then it was taken for one with them from afar.
+        """
+        pieces = self.pieces(instance)
+        own = self.samples.footprint(segment, instance.support)
+        for piece in pieces:
+            other = self.samples.footprint(piece, instance.support)
+            ways = narrowest(instance.support, own, other)
+            if ways is None or instance.support.connects(own, other):
+                return False
+            larger_m2 = max(self.segments[segment].area_m2, self.segments[piece].area_m2)
+            if not gap_between(self.samples, *ways, instance.plane, self.tolerance).parts(larger_m2, self.config):
+                return False
+        return bool(pieces)
+
+    def _joined(self, segment: int, footprint: Cells, instance: PlanarInstance, fits_well: bool) -> bool:
+        """Whether a footprint adjoins an instance or, if it fits well, has a short gap to it that is hidden; and the
+        gap does not part them.
+        """
+        adjoining = adjoins(instance.support.near(footprint, self.config.max_gap_m))
+        ways = shortest_gap(instance.support, footprint, self.config.bridge_m)
+        if ways is None:
+            return adjoining
+        gap = gap_between(self.samples, *ways, instance.plane, self.tolerance)
+        if gap.parts(max(instance.area_m2, self.segments[segment].area_m2), self.config):
             return False
-        seen_through, in_image = gap_between(self.samples, *gap, instance.plane, self.tolerance)
-        return in_image and not seen_through
+        return adjoining or (fits_well and gap.hidden)
 
 
 def adjoins(beside: NDArray[np.bool_]) -> bool:
@@ -180,21 +228,29 @@ def adjoins(beside: NDArray[np.bool_]) -> bool:
 
 
 def shortest_gap(support: Support, cells: Cells, longest_m: float) -> tuple[Vector, Vector] | None:
-    """Places [K, 3] m of cells [N, 2], and those [K, 3] of the extent on whose grid they are, between which the gap is
-    narrowest: a few, from all along it.
-
-    None where it is wider than longest_m, or than twice the size of the smaller of the two.
+    """`narrowest` between an extent and cells [N, 2] of its grid; None where even that is wider than longest_m or, if
+    longest_m is finite, than twice the size of the smaller of the two.
     """
     occupied, _ = support.cells()
-    if len(occupied) == 0 or len(cells) == 0:
+    gap = narrowest(support, cells, occupied)
+    if gap is None or not np.isfinite(longest_m):
+        return gap
+    limit_m = min(longest_m, _GAP_RATIO * support.cell_m * np.sqrt(min(len(occupied), len(cells))))
+    return gap if np.linalg.norm(gap[1] - gap[0], axis=1).min() <= limit_m + 1e-9 else None
+
+
+def narrowest(support: Support, cells: Cells, others: Cells) -> tuple[Vector, Vector] | None:
+    """Places [K, 3] m of cells [N, 2] of a grid, and those [K, 3] of other cells, between which the gap is narrowest: a
+    few, from all along it. None without cells.
+    """
+    if len(others) == 0 or len(cells) == 0:
         return None
-    distance, nearest = cKDTree(occupied).query(cells)
+    distance, nearest = cKDTree(others).query(cells)
     least = float(distance.min())
-    if least > min(longest_m / support.cell_m, _GAP_RATIO * np.sqrt(min(len(occupied), len(cells)))):
-        return None
-    narrow = np.flatnonzero(distance <= least + _GAP_SLACK_CELLS)
+    slack = _GAP_SLACK_CELLS if least > _TOUCHING_CELLS else 0.0
+    narrow = np.flatnonzero(distance <= least + slack)
     chosen = narrow[np.linspace(0, len(narrow) - 1, min(len(narrow), _GAP_PLACES)).astype(int)]
-    return support.centres(cells[chosen]), support.centres(occupied[nearest[chosen]])
+    return support.centres(cells[chosen]), support.centres(others[nearest[chosen]])
 
 
 def coplanar_in_views(a: PlanarInstance, b: PlanarInstance) -> float | None:
@@ -208,10 +264,3 @@ def coplanar_in_views(a: PlanarInstance, b: PlanarInstance) -> float | None:
         return None
     ours, theirs = (stacked(side) for side in zip(*pairs, strict=True))
     return float(np.median(np.maximum(deviation_sigmas(ours, theirs), deviation_sigmas(theirs, ours))))
-
-
-def _with_model_error(planes: PlaneEstimate, areas_m2: NDArray[np.float64], sigma_m: float) -> PlaneEstimate:
-    """Real surfaces stray from a plane by so much, which leaves its angle uncertain by as much over its size."""
-    variance = np.full((len(areas_m2), 3), sigma_m**2)
-    variance[:, :2] /= np.maximum(areas_m2, 1e-4)[:, None]
-    return replace(planes, covariance=planes.covariance + variance[:, :, None] * np.eye(3))

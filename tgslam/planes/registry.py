@@ -9,16 +9,14 @@ from numpy.typing import NDArray
 
 from tgslam.config.schema import PlanesConfig
 from tgslam.geometry import inverse
-from tgslam.planes.association import gate
-from tgslam.planes.estimate import PlaneEstimate, stacked
+from tgslam.planes.estimate import PlaneEstimate
 from tgslam.planes.instance import NO_ID, PlanarInstance, Poses
-from tgslam.planes.matching import WELL, ViewMatching, adjoins, coplanar_in_views, shortest_gap
+from tgslam.planes.joining import Joining
+from tgslam.planes.matching import LEAST_SAMPLES, ViewMatching
 from tgslam.planes.segment import PlaneView
-from tgslam.planes.sight import Samples, Sight, Tolerance, gap_between
+from tgslam.planes.sight import Samples, Sight, Tolerance
 from tgslam.types import Camera, FloatImage
 
-_LEAST_SAMPLES = 12  # of a plane's extent in view, for the view to say something against it
-_MOST = 0.5
 _SUSPECT_PLANES = 3  # so many contradicted at once, and more than confirmed: the pose is wrong, not the planes
 
 
@@ -51,7 +49,7 @@ class PlaneRegistry:
         self._instances: list[PlanarInstance] = []  # candidates included, oldest first
         self._poses: dict[int, NDArray[np.float64]] = {}  # keyframe -> T_wc [4, 4]
         self._absorbed_by: dict[int, int] = {}
-        self._apart: set[frozenset[PlanarInstance]] = set()  # coplanar pairs between which a view looks through
+        self._joining = Joining(config, self._tolerance)
         self._next_id = 0
 
     @property
@@ -80,6 +78,10 @@ class PlaneRegistry:
         views = {i: instance.view(keyframe) for i, instance in self.instances.items() if keyframe in instance.keyframes}
         return {i: view for i, view in views.items() if view is not None}
 
+    def parted_from(self, plane_id: int) -> list[PlanarInstance]:
+        """The PGIs level with one that a gap parts from it."""
+        return [other for other in self._joining.parted_from(self.instances[plane_id]) if other.id in self.instances]
+
     def observe(
         self, view: PlaneView, depth_m: FloatImage, camera: Camera, T_cw: NDArray[np.float64], keyframe: int
     ) -> Observation:
@@ -95,7 +97,7 @@ class PlaneRegistry:
         created = self._confirm(seen, matching)
         removed = self._weigh_contradictions(matching, seen)
         created += self._split(seen)
-        merged = self._merge(seen, samples)
+        merged = [*self._overrule(matching, seen), *self._merge(seen, samples)]
         ids = [self._id_of(owner, keyframe) for owner in matching.owner]
         return Observation(keyframe, np.array(ids, np.int32), tuple(created), tuple(merged), tuple(removed))
 
@@ -116,11 +118,23 @@ class PlaneRegistry:
         """Give every segment its instance; new ones for those that neither overlap nor continue one that there is."""
         for careful in (True, False):
             for segment, instance in matching.overlapping(careful):
-                matching.give(segment, instance, keyframe)
+                self._give(matching, segment, instance, keyframe)
         for segment in range(len(matching.segments)):
             if matching.owner[segment] is None:
                 found = matching.continued(segment)
-                matching.give(segment, found or PlanarInstance(matching.world(segment), self._config), keyframe)
+                if found is None:
+                    found = PlanarInstance(matching.world(segment), self._config)
+                    self._part(segment, found, matching)
+                self._give(matching, segment, found, keyframe)
+
+    def _give(self, matching: ViewMatching, segment: int, instance: PlanarInstance, keyframe: int) -> None:
+        matching.give(segment, instance, keyframe, self._joining.parted_from(instance))
+
+    def _part(self, segment: int, new: PlanarInstance, matching: ViewMatching) -> None:
+        """Take from the instances that were thought to go on over a gap what lies beyond, where that parts them."""
+        for instance in matching.parted(segment):
+            new.support.absorb(*matching.beyond_gap(segment, instance))
+            self._joining.part(instance, new)
 
     def _integrate(self, matching: ViewMatching, keyframe: int) -> list[PlanarInstance]:
         """Hand each instance its view; returns the instances in view, oldest first."""
@@ -153,7 +167,7 @@ class PlaneRegistry:
             instance.support.weaken(view.through_cells)
             if instance in against:
                 instance.through += 1
-            elif len(view.shown) >= _LEAST_SAMPLES:
+            elif len(view.shown) >= LEAST_SAMPLES:
                 instance.through = 0
         ended = [i for i in self._instances if self._is_refuted(i)]
         self._instances = [i for i in self._instances if i not in ended]
@@ -161,7 +175,7 @@ class PlaneRegistry:
 
     def _contradicts(self, view: Sight) -> bool:
         visible = view.through_count + len(view.shown)
-        return visible >= _LEAST_SAMPLES and view.through_share >= self._config.through_share
+        return visible >= LEAST_SAMPLES and view.through_share >= self._config.through_share
 
     def _is_refuted(self, instance: PlanarInstance) -> bool:
         """One view that sees through it is enough against a candidate."""
@@ -174,68 +188,37 @@ class PlaneRegistry:
         self._instances += parts
         return [self._name(part) for part in parts]
 
+    def _overrule(self, matching: ViewMatching, seen: list[PlanarInstance]) -> list[tuple[int, int]]:
+        """Let go of instances that views count to another one: that takes their ids, but not their bent planes."""
+        merged: list[tuple[int, int]] = []
+        for kept, bent in self._joining.overruled(matching, seen):
+            if kept in self._instances and bent in self._instances:
+                merged += self._replace(bent, kept)
+        return merged
+
     def _merge(self, touched: list[PlanarInstance], samples: Samples | None) -> list[tuple[int, int]]:
         """Make one of each pair of instances that turn out to be the same surface; (kept, absorbed) of PGIs."""
-        merged = []
-        while (twins := self._twins([i for i in touched if i in self._instances], samples)) is not None:
+        merged: list[tuple[int, int]] = []
+        while True:
+            touched = [i for i in touched if i in self._instances]
+            twins = self._joining.twins(touched, self._instances, samples)
+            if twins is None:
+                return merged
             # A PGI before a candidate, then the older one
             kept, absorbed = sorted(twins, key=lambda i: (i.id == NO_ID, i.id, i.keyframes[0]))
             kept.absorb(absorbed, self._poses)
-            self._instances = [i for i in self._instances if i is not absorbed]
-            self._apart = {frozenset(kept if i is absorbed else i for i in pair) for pair in self._apart}
+            merged += self._replace(absorbed, kept)
             touched = [*touched, kept]
-            if absorbed.id != NO_ID:
-                self._absorbed_by[absorbed.id] = kept.id
-                merged.append((kept.id, absorbed.id))
-        return merged
 
-    def _twins(
-        self, touched: list[PlanarInstance], samples: Samples | None
-    ) -> tuple[PlanarInstance, PlanarInstance] | None:
-        """An instance out of `touched`, and another one, that are the same surface."""
-        config = self._config
-        ours = stacked([i.plane for i in touched])[:, None]
-        theirs = stacked([i.plane for i in self._instances])[None].widened(config.pose_sigma_rad, config.pose_sigma_m)
-        origin = np.zeros(3)  # decides on offset ratios only, which are not used here
-        forth, back = gate(theirs, ours, origin, config), gate(ours, theirs, origin, config)
-        sigmas = np.maximum(forth.deviation_sigmas, back.deviation_sigmas)
-        for i, j in np.argwhere(forth.admitted & back.admitted):
-            a, b = touched[i], self._instances[j]
-            if a is not b and self._coplanar(a, b, float(sigmas[i, j])) and self._joined(a, b, samples):
-                return a, b
-        return None
-
-    def _coplanar(self, a: PlanarInstance, b: PlanarInstance, sigmas: float) -> bool:
-        """In the views that show both or, without any, in the world, where they deviate by `sigmas`: by half the gate
-        unless the extent of one lies for the most part in that of the other.
-        """
-        in_views = coplanar_in_views(a, b)
-        if in_views is not None:
-            return in_views <= self._config.gate_sigmas
-        if sigmas <= WELL * self._config.gate_sigmas:
-            return True
-        large, cells = _on_larger(a, b)
-        return sigmas <= self._config.gate_sigmas and float(np.mean(large.support.holds(cells))) > _MOST
-
-    def _joined(self, a: PlanarInstance, b: PlanarInstance, samples: Samples | None) -> bool:
-        """Whether two coplanar instances adjoin, or have a gap that is hidden or, between large surfaces, out of view.
-
-        Floors, walls and ceilings go on behind things and where no view has looked; table tops are smaller. A gap that
-        any view has looked through parts two instances for good.
-        """
-        large, cells = _on_larger(a, b)
-        if adjoins(large.support.near(cells, self._config.max_gap_m)):
-            return True
-        if samples is None or frozenset((a, b)) in self._apart:
-            return False
-        gap = shortest_gap(large.support, cells, self._config.bridge_m)
-        if gap is None:
-            return False
-        seen_through, in_image = gap_between(samples, *gap, large.plane, self._tolerance)
-        if seen_through:
-            self._apart.add(frozenset((a, b)))
-            return False
-        return in_image or min(a.area_m2, b.area_m2) >= self._config.bridge_area_m2
+    def _replace(self, gone: PlanarInstance, kept: PlanarInstance) -> list[tuple[int, int]]:
+        """An instance lives on as another one; (kept, gone) if it was a PGI."""
+        gone.merged_into = kept
+        self._instances = [i for i in self._instances if i is not gone]
+        self._joining.replace(gone, kept)
+        if gone.id == NO_ID:
+            return []
+        self._absorbed_by[gone.id] = kept.id
+        return [(kept.id, gone.id)]
 
     def _name(self, instance: PlanarInstance) -> int:
         instance.id = self._next_id
@@ -250,9 +233,3 @@ class PlaneRegistry:
             return NO_ID
         split_off = [i.id for i in self._instances if i.split_from is owner and keyframe in i.keyframes]
         return split_off[-1] if split_off and keyframe not in owner.keyframes else owner.id
-
-
-def _on_larger(a: PlanarInstance, b: PlanarInstance) -> tuple[PlanarInstance, NDArray[np.int64]]:
-    """The one of larger extent, and the cells [N, 2] of its grid over which the extent of the other lies."""
-    small, large = sorted((a, b), key=lambda instance: len(instance.support))
-    return large, np.unique(large.support.cells_of(small.support.centres(small.support.cells()[0])), axis=0)

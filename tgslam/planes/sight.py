@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam.config.schema import PlanesConfig
 from tgslam.geometry import inverse, transform_points
 from tgslam.planes.estimate import PlaneEstimate
 from tgslam.planes.segment import PlaneView
@@ -18,7 +19,8 @@ Vector = NDArray[np.float64]
 _NEAREST_M = 0.05  # places nearer to the camera's plane than this are not projected
 _GRAZING_COSINE = 0.05  # rays flatter than this say nothing of where they meet a plane
 _LEAST_THROUGH, _THROUGH_SHARE = 3, 0.1  # of the places in a gap: fewer are noise
-_STEP_M = 0.02  # between the places at which a gap is looked at
+_CLOSE_M, _FILLED_SHARE = 0.15, 0.5  # before a plane; of the places in a gap that do not show the plane
+_STEP_M = 0.01  # between the places at which a gap is looked at
 _MAX_FOOTPRINT_CELLS = 1 << 20  # a degenerate segment does not make the grid explode
 
 
@@ -143,13 +145,23 @@ def may_appear(samples: Samples, planes: PlaneEstimate, corners_w: Vector) -> ND
     return front
 
 
-def gap_between(
-    samples: Samples, starts_w: Vector, ends_w: Vector, plane: PlaneEstimate, tolerance: Tolerance
-) -> tuple[bool, bool]:
-    """Straight ways [K, 3] to [K, 3] m in a plane: is any of them seen through, are all of them in the image?
+@dataclass(frozen=True)
+class Gap:
+    """What a keyframe shows of the ways between two parts of a plane."""
 
-    Where they are not seen through, the plane may go on behind something else.
-    """
+    open: bool  # one of them is seen through: the parts are two surfaces, or one with a hole
+    hidden: bool  # all of them are in the image and none is seen through: the plane may go on behind something else
+    filled: bool  # most of what is seen there stands close before the plane, as a board between two fronts does
+
+    def parts(self, larger_m2: float, config: PlanesConfig) -> bool:
+        """Whether it parts two surfaces, of which the larger one has such an area: what fills it hides which they are,
+        and small things that happen to be level are as likely as one behind a board.
+        """
+        return self.open or (self.filled and larger_m2 < config.across_area_m2)
+
+
+def gap_between(samples: Samples, starts_w: Vector, ends_w: Vector, plane: PlaneEstimate, tolerance: Tolerance) -> Gap:
+    """Look at straight ways [K, 3] to [K, 3] m in a plane."""
     longest_m = float(np.linalg.norm(ends_w - starts_w, axis=1).max())
     steps = max(int(longest_m / _STEP_M), 3)
     share = np.linspace(0.0, 1.0, steps + 2)[1:-1, None, None]
@@ -162,4 +174,8 @@ def gap_between(
     limit = tolerance.sigmas * np.hypot(tolerance.sensor_per_m2 * z**2, tolerance.pose_m)
     through = ((z > 0) & (height < -limit)).reshape(steps, -1).sum(axis=0)
     seen = inside.reshape(steps, -1).sum(axis=0)
-    return bool(np.any(through >= np.maximum(_LEAST_THROUGH, _THROUGH_SHARE * seen))), bool(inside.all())
+    opened = bool(np.any(through >= np.maximum(_LEAST_THROUGH, _THROUGH_SHARE * seen)))
+    # The ends of the ways show the parts themselves
+    between = (z > 0) & (np.abs(height) > limit)
+    close = between & (height > 0) & (height < _CLOSE_M)
+    return Gap(opened, bool(inside.all()) and not opened, bool(close.sum() > _FILLED_SHARE * between.sum()))

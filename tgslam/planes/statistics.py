@@ -21,6 +21,7 @@ class Evidence:
     segment: PlaneSegment
     bend_sigmas: float  # root mean square of the part of the residual that is a paraboloid, in standard deviations
     bend_m: float  # the same, of depth at the centroid
+    curvature: float  # 1/m, the larger one of that paraboloid
     cosine: float  # of the angle between normal and line of sight at the centroid
     width_px: float  # across its longest direction, of a rectangle as wide
 
@@ -63,9 +64,15 @@ def evidence(plane: Floats, change: Floats, rows: SegmentSums, grid: CellGrid, s
         rms_m=float(np.sqrt(mean_square * (rows.pixels * depth**4).sum() / pixels)),
         reliable=False,
     )
-    bend = _bend(residual, rows.moments)
-    cosine = float(-normal @ mean_ray / np.linalg.norm(mean_ray))
-    return Evidence(segment, bend / sigma, bend * float(centroid[2]) ** 2, cosine, width_px(moments))
+    bend, hessian = _bend(residual, rows.moments)
+    return Evidence(
+        segment,
+        bend_sigmas=bend / sigma,
+        bend_m=bend * float(centroid[2]) ** 2,
+        curvature=_curvature(hessian, segment, grid),
+        cosine=float(-normal @ mean_ray / np.linalg.norm(mean_ray)),
+        width_px=width_px(moments),
+    )
 
 
 def width_px(moments: Floats) -> float:
@@ -116,16 +123,29 @@ def _correlation(residual: Floats, rows: SegmentSums, grid: CellGrid, sigma: flo
     return found
 
 
-def _bend(residual: Floats, moments: Floats) -> float:
-    """Root mean square, 1/m, of the paraboloid that fits the cells' residuals [R]; moments [R, 10]."""
+def _bend(residual: Floats, moments: Floats) -> tuple[float, Floats]:
+    """The paraboloid that fits the cells' residuals [R], moments [R, 10]: its root mean square, 1/m, beyond a plane,
+    and its second derivatives [2, 2], 1/m per px^2.
+    """
     weight = moments[:, 0]
     if len(weight) < 6:
-        return 0.0
+        return 0.0, np.zeros((2, 2))
     x, y = moments[:, 1] / weight, moments[:, 2] / weight
-    x, y = (x - x.mean()) / max(np.ptp(x), 1.0), (y - y.mean()) / max(np.ptp(y), 1.0)
+    width, height = max(np.ptp(x), 1.0), max(np.ptp(y), 1.0)
+    x, y = (x - x.mean()) / width, (y - y.mean()) / height
     basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
     normal, right = basis * weight @ basis.T, basis @ residual
     flat = np.linalg.lstsq(normal[:3, :3], normal[:3, 3:], rcond=1e-9)[0]
     curvature, slope = normal[3:, 3:] - normal[3:, :3] @ flat, right[3:] - flat.T @ right[:3]
-    gain = slope @ np.linalg.lstsq(curvature, slope, rcond=1e-6)[0]
-    return float(np.sqrt(max(gain, 0.0) / weight.sum()))
+    xx, xy, yy = found = np.linalg.lstsq(curvature, slope, rcond=1e-6)[0]
+    hessian = np.array([[2 * xx / width**2, xy / (width * height)], [xy / (width * height), 2 * yy / height**2]])
+    return float(np.sqrt(max(slope @ found, 0.0) / weight.sum())), hessian
+
+
+def _curvature(hessian: Floats, segment: PlaneSegment, grid: CellGrid) -> float:
+    """The larger principal curvature, 1/m, of a surface whose inverse depth has these second derivatives [2, 2]."""
+    z, focal = segment.centroid_c[2], np.array([grid.camera.fx, grid.camera.fy])
+    slope = segment.normal_c[:2] / (segment.normal_c @ segment.centroid_c)  # of 1/z, per unit of x/z and y/z
+    steps = np.vstack([np.eye(2), np.zeros(2)]) * z - np.outer(segment.centroid_c * z, slope)  # of the point, per same
+    to_plane = np.linalg.inv(np.array(tangents(segment.normal_c)) @ steps / focal)
+    return float(np.abs(np.linalg.eigvalsh(segment.offset_m * z * to_plane.T @ hessian @ to_plane)).max())

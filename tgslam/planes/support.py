@@ -69,6 +69,36 @@ class Support:
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
         return _lookup(cv2.dilate(padded, kernel) if padded.size else padded, cells - self._low + reach)
 
+    def connects(self, cells: Cells, others: Cells) -> bool:
+        """Whether occupied cells lead from one of the cells [N, 2] to one of the others, side by side."""
+        return bool(np.intersect1d(self._parts(cells), self._parts(others)).size)
+
+    def take_part(self, cells: Cells, kept: Cells) -> tuple[Vector, NDArray[np.int32]]:
+        """Give away the connected parts to which cells [N, 2] belong, but for those that hold a kept cell [M, 2].
+
+        Returns with the places [K, 3] m, world, and the keyframes [K] that saw them first.
+        """
+        parts = np.setdiff1d(self._parts(cells), self._parts(kept))
+        taken = np.isin(self._components(), parts)
+        rows, columns = np.nonzero(taken)
+        places, keyframes = self.centres(np.column_stack([rows, columns]) + self._low), self._keyframe[rows, columns]
+        self._evidence[taken] = 0
+        return places, keyframes
+
+    def _components(self) -> NDArray[np.int32]:
+        """The connected part of each cell of the arrays, from 1; 0 = not occupied."""
+        if not self._evidence.size:
+            return np.zeros(self._evidence.shape, np.int32)
+        components: NDArray[np.int32] = cv2.connectedComponents((self._evidence > 0).astype(np.uint8), connectivity=4)[
+            1
+        ]
+        return components
+
+    def _parts(self, cells: Cells) -> NDArray[np.int32]:
+        """The connected parts that these cells [N, 2] belong to."""
+        inside = cells[self.holds(cells)] - self._low
+        return np.unique(self._components()[inside[:, 0], inside[:, 1]])
+
     def add(self, cells: Cells, keyframe: int | NDArray[np.int32], evidence: int = 1) -> None:
         """One view's evidence for cells [N, 2], each listed once, seen from `keyframe` (one, or one a cell)."""
         if len(cells) == 0:
