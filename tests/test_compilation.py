@@ -7,7 +7,7 @@ import pytest
 import taichi as ti
 
 from tgslam import runtime
-from tgslam.quick_import import quick_decorators
+from tgslam.quick_import import quick_import
 
 
 @ti.kernel
@@ -105,7 +105,7 @@ def test_an_error_in_a_function_names_its_statement_and_the_one_that_calls() -> 
 
 
 def test_a_method_of_a_class_is_still_told_from_a_function() -> None:
-    with quick_decorators():
+    with quick_import():
 
         @ti.data_oriented
         class Counter:

@@ -20,7 +20,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import taichi as ti
-from taichi.lang import expr, kernel_impl
+from taichi.lang import (
+    expr,
+    kernel_impl,
+    matrix_ops,  # noqa: F401  the first kernel would import it, and not quickly
+)
 from taichi.lang.ast.ast_transformer import ASTTransformer
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext, Builder
 

@@ -15,9 +15,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tgslam.quick_import import quick_decorators
+from tgslam.quick_import import quick_import
 
-with quick_decorators():
+with quick_import():
     from taichi._lib import core
     from taichi.lang.kernel_impl import Kernel
 
