@@ -211,22 +211,17 @@ def forward(
 @ti.func
 def chunk_of(image: ti.template(), x0, y0):
     """The pixels of a chunk of an [H, W] image; the image's last column and row go on beyond it."""
-    bottom, right = image.shape[0] - 1, image.shape[1] - 1
-    return Lanes(
-        [image[ti.min(y0 + j // CHUNK, bottom), ti.min(x0 + j % CHUNK, right)] for j in ti.static(range(LANES))]
-    )
+    rows = [ti.min(y0 + i, image.shape[0] - 1) for i in range(CHUNK)]
+    columns = [ti.min(x0 + i, image.shape[1] - 1) for i in range(CHUNK)]
+    return Lanes([image[y, x] for y in rows for x in columns])
 
 
 @ti.func
 def chunk_of_channel(image: ti.template(), x0, y0, channel: ti.template()):
     """The same of one channel of an [H, W, 3] image."""
-    bottom, right = image.shape[0] - 1, image.shape[1] - 1
-    return Lanes(
-        [
-            image[ti.min(y0 + j // CHUNK, bottom), ti.min(x0 + j % CHUNK, right), channel]
-            for j in ti.static(range(LANES))
-        ]
-    )
+    rows = [ti.min(y0 + i, image.shape[0] - 1) for i in range(CHUNK)]
+    columns = [ti.min(x0 + i, image.shape[1] - 1) for i in range(CHUNK)]
+    return Lanes([image[y, x, channel] for y in rows for x in columns])
 
 
 @ti.func

@@ -31,6 +31,9 @@ _EXP_8TH = tuple(c / 8.0**k for k, c in enumerate(_EXP))
 Lanes = ti.types.vector(LANES, ti.f32)
 LANE_X = tuple(float(j % CHUNK) for j in range(LANES))  # px, of a lane's pixel in its chunk
 LANE_Y = tuple(float(j // CHUNK) for j in range(LANES))
+# By distance, as tables: Taichi would walk the expressions for every lane of every use again, in every process
+_SWAPPED = {distance: tuple(j ^ distance for j in range(LANES)) for distance in (1, 2, 4, 8)}
+_UPPER = {distance: tuple(float(j & distance) for j in range(LANES)) for distance in _SWAPPED}
 
 
 def lanes_kernel(function: Callable[..., None]) -> Callable[..., None]:
@@ -101,7 +104,7 @@ def exp_neg(q):
 @ti.func
 def swapped(v, distance: ti.template()):
     """Lane j gets lane j ^ distance."""
-    return Lanes([v[j ^ distance] for j in ti.static(range(LANES))])
+    return Lanes([v[j] for j in _SWAPPED[distance]])
 
 
 @ti.func
@@ -123,7 +126,7 @@ def lane_max(v):
 @ti.func
 def merged(a, b, distance: ti.template()):
     """Lane j gets a[j] + a[j ^ distance] where j & distance is 0, the same of b elsewhere."""
-    upper = Lanes([float(j & distance) for j in range(LANES)]) > Lanes(0.0)
+    upper = Lanes(_UPPER[distance]) > Lanes(0.0)
     return ti.select(upper, b, a) + ti.select(upper, swapped(b, distance), swapped(a, distance))
 
 

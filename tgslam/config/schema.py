@@ -131,7 +131,10 @@ class MappingConfig:
 
     optimizer: str = setting("relaxation", choices=("relaxation", "adam"))  # how colours move; geometry moves by Adam
     window: int = setting(6, 1, 1000)  # latest keyframes refined together
-    window_random: int = setting(2, 0, 1000)  # and with them so many, drawn from all earlier ones
+    anchors: str = setting(
+        "structure", choices=("structure", "random", "none")
+    )  # earlier ones that are refined with it
+    anchor_count: int = setting(2, 0, 1000)  # SGVs, whose poses hold still
     iterations: int = setting(12, 0, 10_000)  # views rendered and refined a keyframe
     final_iterations: int = setting(60, 0, 1_000_000)  # after the last frame, over all keyframes; 0 = off
     refine_poses: bool = setting(True)
@@ -241,6 +244,9 @@ class ClosureConfig:
     # A step's error beyond what tracking's residuals show
     odometry_sigma_rad: float = setting(0.001, 1e-7, 1.0)
     odometry_sigma_m: float = setting(0.003, 1e-7, 1.0)
+    # The map follows when a keyframe has moved or turned by so much
+    least_shift_m: float = setting(0.001, 0.0, 1.0)
+    least_turn_rad: float = setting(0.0005, 0.0, 1.0)
     robust: str = setting("cauchy", choices=("none", "huber", "cauchy", "dcs"))  # noise of closures and planes
     robust_sigmas: float = setting(3.0, 0.1, 1000.0)  # beyond which an error counts less
     relinearise: float = setting(0.01, 0.0, 1.0)  # rad and m; with solver: incremental

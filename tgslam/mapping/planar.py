@@ -57,7 +57,7 @@ class PlanarMapping:
 
         keyframes: all of the run so far, one more at each call.
         """
-        self._follow(keyframes)
+        self.follow(keyframes)
         keyframe, number = keyframes[-1], len(keyframes) - 1
         self._T_cw.append(keyframe.T_cw.copy())
         depth_m = keyframe.depth_m()
@@ -91,7 +91,7 @@ class PlanarMapping:
             plane_ids[named[distance < self.config.max_distance_m]] = plane_id
         gaussians.write("plane_id", slice(0, gaussians.count), plane_ids)
 
-    def _follow(self, keyframes: Sequence[Keyframe]) -> None:
+    def follow(self, keyframes: Sequence[Keyframe]) -> None:
         """Move the PGIs with the keyframes that saw them."""
         corrections = {}
         for number, known in enumerate(self._T_cw):
