@@ -2,16 +2,31 @@
 
 A splat is what the rasterizer needs of a Gaussian: centre, inverse covariance, opacity, tangent-plane depth, colour.
 Columns of a splat row, and of the moments that the rasterizer's backward pass sums for it, are the constants below.
+
+The functions take scalars and Lanes alike: a CUDA thread works on one Gaussian, the CPU on 16 at once. Vectors are lists
+of components (matrices lists of rows) that Taichi takes apart when it translates.
 """
 
 import taichi as ti
 
 from tgslam.kernels.cuda.warp import WARP, warp_sum
-from tgslam.kernels.simd import REACH, TILE
+from tgslam.kernels.simd import (
+    LANES,
+    REACH,
+    TILE,
+    Lanes,
+    exponential,
+    filled,
+    held,
+    indicator,
+    lane_max,
+    lanes_kernel,
+    larger,
+    magnitude,
+)
 
 nd = ti.types.ndarray
 mat3 = ti.types.matrix(3, 3, ti.f32)
-mat23 = ti.types.matrix(2, 3, ti.f32)
 
 U, V, QA, QB, QC, FADE, Z, ZU, ZV, RED, EMBEDDING, INV_Z = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 12, 15
 SPLAT = 16  # columns of a splat row: centre px, half the inverse covariance, -ln(opacity), depth and its slope, colours
@@ -26,91 +41,211 @@ BLUR = 0.3  # px^2 added to the screen covariance, the 3DGS standard's low-pass 
 NEAR_M = 0.05
 EDGE = 1.3  # the Jacobian is evaluated at most this many half-images off the axis
 POSE_BLOCK = WARP  # Gaussians whose pose gradients one writer sums
+_COLUMNS = 9  # of a splat row, U to ZV, that `splat_of` returns in their order, and INV_Z after them
+# log((1 + t) / (1 - t)) / t by t^2, |t| <= 1/3, to 8e-9 relative: Lawson's iteratively reweighted least squares
+_LOG = (2.0, 0.66666317, 0.400249094, 0.279606044, 0.281783342)
 
 
 @ti.func
 def sigmoid(x):
     """Logistic function, stable for both signs."""
-    e = ti.exp(-ti.abs(x))
-    return ti.select(x >= 0, 1.0 / (1.0 + e), e / (1.0 + e))
+    e = exponential(0.0 - magnitude(x))
+    share = 1.0 / (1.0 + e)
+    return ti.select(x < filled(x, 0.0), e * share, share)
+
+
+@ti.func
+def softplus(x):
+    """log(1 + exp(x)), stable for both signs."""
+    e = exponential(0.0 - magnitude(x))
+    t = e / (2.0 + e)
+    tt = t * t
+    return larger(x, filled(x, 0.0)) + t * (_LOG[0] + tt * (_LOG[1] + tt * (_LOG[2] + tt * (_LOG[3] + tt * _LOG[4]))))
+
+
+@ti.func
+def rotation_rows(w, x, y, z):
+    """Unit quaternion -> rotation matrix, as a list of rows."""
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
 
 
 @ti.func
 def rotation_from_quat(w, x, y, z):
     """Unit quaternion -> rotation matrix."""
-    return mat3(
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    )
+    return mat3(rotation_rows(w, x, y, z))
 
 
 @ti.func
-def rotation_of_pose(pose: ti.template()):
-    """The rotation of T_cw, stored row by row as [R | t]."""
-    return mat3([pose[0], pose[1], pose[2]], [pose[4], pose[5], pose[6]], [pose[8], pose[9], pose[10]])
+def dot(a: ti.template(), b: ti.template()):
+    """a . b"""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @ti.func
-def clamped(ratio, centre, focal, size):
+def cross(a: ti.template(), b: ti.template()):
+    """a x b"""
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+@ti.func
+def in_camera(pose: ti.template(), mean: ti.template()):
+    """The centre in the camera's frame; T_cw is stored row by row as [R | t]."""
+    return [
+        pose[4 * r] * mean[0] + pose[4 * r + 1] * mean[1] + pose[4 * r + 2] * mean[2] + pose[4 * r + 3]
+        for r in ti.static(range(3))
+    ]
+
+
+@ti.func
+def axes_in_camera(pose: ti.template(), q: ti.template()):
+    """R Rq, whose columns are the Gaussian's axes in the camera's frame, as a list of rows."""
+    Rq = rotation_rows(q[0], q[1], q[2], q[3])
+    return [
+        [pose[4 * r] * Rq[0][k] + pose[4 * r + 1] * Rq[1][k] + pose[4 * r + 2] * Rq[2][k] for k in ti.static(range(3))]
+        for r in ti.static(range(3))
+    ]
+
+
+@ti.func
+def inverse_norm(q: ti.template()):
+    """1 / |q|"""
+    return 1.0 / ti.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+
+
+@ti.func
+def in_view(ratio, centre, focal, size):
     """x/z (or y/z) limited to EDGE half-images, so that the linearisation stays sane beside the camera."""
-    low = (-0.5 * (EDGE - 1.0) * size - centre) / focal
-    high = ((1.0 + 0.5 * (EDGE - 1.0)) * size - centre) / focal
-    return ti.min(ti.max(ratio, low), high)
+    margin = 0.5 * (EDGE - 1.0)
+    return held(ratio, (-margin * size - centre) / focal, ((1.0 + margin) * size - centre) / focal)
 
 
 @ti.func
-def blurred_determinant(ax: ti.template(), ay: ti.template(), blur):
-    """det of the screen covariance A A^T + blur I, by Lagrange's identity for det(A A^T).
+def scaled(s: ti.template(), v: ti.template()):
+    """The components of v, each times its own of s."""
+    return [s[k] * v[k] for k in ti.static(range(3))]
+
+
+@ti.func
+def mixed(a, v: ti.template(), b, w: ti.template()):
+    """a v + b w"""
+    return [a * v[k] + b * w[k] for k in ti.static(range(3))]
+
+
+@ti.func
+def inverse_determinant(area, xx, yy, blur):
+    """1 / det of the screen covariance A A^T + blur I, by Lagrange's identity for det(A A^T) = |ax x ay|^2.
 
     cxx cyy - cxy^2 cancels to nothing in float32 for a long thin splat across the pixel grid; this sums positive terms.
     """
-    return ax.cross(ay).norm_sqr() + blur * (ax.norm_sqr() + ay.norm_sqr() + blur)
+    return 1.0 / (area + blur * (xx + yy + blur))
 
 
 @ti.func
-def precision_times_rows(ax: ti.template(), ay: ti.template(), blur):
-    """B = (A A^T + blur I)^-1 A, with the triple product since, for the reason above, B is small where A is large."""
-    n = ax.cross(ay)
-    inv_det = 1.0 / blurred_determinant(ax, ay, blur)
-    return (ay.cross(n) + blur * ax) * inv_det, (n.cross(ax) + blur * ay) * inv_det
+def rows_of_tiles(centre, radius, size):
+    """First and last row (or column) of tiles that [centre - radius, centre + radius] px touches, and 1 if any."""
+    low, high = centre - radius, centre + radius
+    first = ti.floor(held(low, 0.0, size - 1.0) * (1.0 / TILE))
+    last = ti.floor(held(high, 0.0, size - 1.0) * (1.0 / TILE))
+    return first, last, (1.0 - indicator(high, filled(high, 0.0))) * (1.0 - indicator(filled(low, size - 1.0), low))
 
 
 @ti.func
-def axes_in_camera(R: ti.template(), Rq: ti.template(), s: ti.template()):
-    """M = R Rq diag(s): the Gaussian's axes in the camera frame, as long as its standard deviations."""
-    M = R @ Rq
-    for k in ti.static(range(3)):
-        for r in ti.static(range(3)):
-            M[r, k] *= s[k]
-    return M
+def splat_of(
+    point: ti.template(),  # in the camera's frame
+    log_scale,
+    quat,
+    opacity_logit,
+    pose: ti.template(),
+    camera: ti.template(),
+    width,
+    height,
+):
+    """A splat's columns, then the first and last tile in x and in y (last < first: none), in whole floats."""
+    fx, fy = camera[0], camera[1]
+    inv_norm = inverse_norm(quat)
+    q = [quat[k] * inv_norm for k in ti.static(range(4))]
+    axes = axes_in_camera(pose, q)
+    s = [exponential(log_scale[k]) for k in ti.static(range(3))]
+    z = larger(point[2], filled(point[2], NEAR_M))  # what lies nearer is not drawn, but stays finite
+    inv_z = 1.0 / z
+    x, y = point[0] * inv_z, point[1] * inv_z
+    j0, j1 = fx * inv_z, fy * inv_z
+    ax = scaled(s, mixed(j0, axes[0], 0.0 - j0 * in_view(x, camera[2], fx, width), axes[2]))
+    ay = scaled(s, mixed(j1, axes[1], 0.0 - j1 * in_view(y, camera[3], fy, height), axes[2]))
+    mz = scaled(s, axes[2])
+    normal = cross(ax, ay)
+    area, xx, xy, yy = dot(normal, normal), dot(ax, ax), dot(ax, ay), dot(ay, ay)
+    inv_det = inverse_determinant(area, xx, yy, BLUR)
+    inv_depth_det = inverse_determinant(area, xx, yy, BLUR_DEPTH)
+    cxx, cyy = xx + BLUR, yy + BLUR
+    zu = (dot(mz, cross(ay, normal)) + BLUR_DEPTH * dot(mz, ax)) * inv_depth_det
+    zv = (dot(mz, cross(normal, ax)) + BLUR_DEPTH * dot(mz, ay)) * inv_depth_det
+    u, v = fx * x + camera[2], fy * y + camera[3]
+    fade = softplus(0.0 - opacity_logit)
+    reach = 2.0 * (REACH - fade)  # Mahalanobis^2 where alpha has fallen to ALPHA_MIN
+    seen = indicator(filled(reach, 0.0), reach) * indicator(filled(z, NEAR_M), point[2])
+    reach = larger(reach, filled(reach, 0.0))
+    x0, x1, seen_x = rows_of_tiles(u, ti.sqrt(reach * cxx), width)
+    y0, y1, seen_y = rows_of_tiles(v, ti.sqrt(reach * cyy), height)
+    seen *= seen_x * seen_y
+    return [
+        u, v, 0.5 * cyy * inv_det, (0.0 - xy) * inv_det, 0.5 * cxx * inv_det, fade, z, zu, zv, inv_z,
+        seen * x0, seen * (x1 + 1.0) - 1.0, seen * y0, seen * (y1 + 1.0) - 1.0,
+    ]  # fmt: skip
 
 
 @ti.func
-def quat_gradient(H: ti.template(), q: ti.template()):
-    """Gradient by the unit quaternion q, given that by its rotation matrix."""
-    w, a, b, c = q[0], q[1], q[2], q[3]
-    skew = ti.Vector([H[2, 1] - H[1, 2], H[0, 2] - H[2, 0], H[1, 0] - H[0, 1]])
-    ab, ac, bc = H[0, 1] + H[1, 0], H[0, 2] + H[2, 0], H[1, 2] + H[2, 1]
-    return 2.0 * ti.Vector(
-        [
-            a * skew[0] + b * skew[1] + c * skew[2],
-            w * skew[0] + b * ab + c * ac - 2.0 * a * (H[1, 1] + H[2, 2]),
-            w * skew[1] + a * ab + c * bc - 2.0 * b * (H[0, 0] + H[2, 2]),
-            w * skew[2] + a * ac + b * bc - 2.0 * c * (H[0, 0] + H[1, 1]),
-        ]
-    )
+def store_splat(
+    i,
+    columns: ti.template(),
+    colour: ti.template(),
+    embedding: ti.template(),
+    with_embedding: ti.template(),
+    splat: ti.template(),
+    tile_rect: ti.template(),
+    tile_count: ti.template(),
+):
+    """Write what `splat_of` made of a Gaussian."""
+    for k in ti.static(range(_COLUMNS)):
+        splat[i, k] = columns[k]
+    splat[i, INV_Z] = columns[_COLUMNS]
+    for c in ti.static(range(3)):
+        splat[i, RED + c] = colour[i, c]
+        if ti.static(with_embedding):
+            splat[i, EMBEDDING + c] = sigmoid(embedding[i, c])
+    store_tiles(i, [ti.cast(columns[_COLUMNS + 1 + k], ti.i32) for k in ti.static(range(4))], tile_rect, tile_count)
 
 
 @ti.func
-def jacobian_gradient(g, focal, ratio, limited, inv_z2):
-    """Gradients by x (or y) and by z of the Jacobian entry -limited focal / z, times g (constant where limited)."""
-    by_z = g * focal * limited * inv_z2
-    free = ratio == limited
-    return ti.select(free, -g * focal * inv_z2, 0.0), ti.select(free, 2.0 * by_z, by_z)
+def store_tiles(i, rect: ti.template(), tile_rect: ti.template(), tile_count: ti.template()):
+    """Write the tiles that a Gaussian touches."""
+    for k in ti.static(range(4)):
+        tile_rect[i, k] = rect[k]
+    tile_count[i] = (rect[1] - rect[0] + 1) * (rect[3] - rect[2] + 1)
 
 
-@ti.kernel
+@ti.func
+def row(i, array: ti.template(), columns: ti.template()):
+    """A row of an array, as a list."""
+    return [array[i, k] for k in ti.static(range(columns))]
+
+
+@ti.func
+def rows(first, count, array: ti.template(), columns: ti.template()):
+    """LANES rows of an array from `first` on as a list of Lanes, a column each; the last of `count` rows goes on."""
+    result = [Lanes(0.0) for k in ti.static(range(columns))]
+    for j in range(LANES):
+        i = ti.min(first + j, count - 1)
+        for k in ti.static(range(columns)):
+            result[k][j] = array[i, k]
+    return result
+
+
+@lanes_kernel
 def project(
     count: ti.i32,
     mean: nd(ti.f32, ndim=2),  # [N, 3] m, world
@@ -129,60 +264,142 @@ def project(
     tile_count: nd(ti.i32, ndim=1),  # [N] out: tiles touched
 ):
     """Gaussians -> splats and the tiles that their alpha >= 1/255 box touches (Zwicker's EWA, as 3DGS)."""
-    for i in range(count):
-        R = rotation_of_pose(pose)
-        x = R @ ti.Vector([mean[i, 0], mean[i, 1], mean[i, 2]]) + ti.Vector([pose[3], pose[7], pose[11]])
-        tile_rect[i, 0], tile_rect[i, 1], tile_rect[i, 2], tile_rect[i, 3] = 0, -1, 0, -1
-        tile_count[i] = 0
-        if x[2] > NEAR_M:
-            fx, fy = camera[0], camera[1]
-            q = ti.Vector([quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3]]).normalized()
-            s = ti.Vector([ti.exp(log_scale[i, k]) for k in range(3)])
-            M = axes_in_camera(R, rotation_from_quat(q[0], q[1], q[2], q[3]), s)
-            inv_z = 1.0 / x[2]
-            jx = -clamped(x[0] * inv_z, camera[2], fx, width) * fx * inv_z
-            jy = -clamped(x[1] * inv_z, camera[3], fy, height) * fy * inv_z
-            ax = ti.Vector([fx * inv_z * M[0, k] + jx * M[2, k] for k in range(3)])
-            ay = ti.Vector([fy * inv_z * M[1, k] + jy * M[2, k] for k in range(3)])
-            mz = ti.Vector([M[2, 0], M[2, 1], M[2, 2]])
-            cxx, cxy, cyy = ax.dot(ax) + BLUR, ax.dot(ay), ay.dot(ay) + BLUR
-            inv_det = 1.0 / blurred_determinant(ax, ay, BLUR)
-            qxx, qxy, qyy = cyy * inv_det, -cxy * inv_det, cxx * inv_det
-            bx, by = precision_times_rows(ax, ay, BLUR_DEPTH)
-            u, v = fx * x[0] * inv_z + camera[2], fy * x[1] * inv_z + camera[3]
-            fade = ti.log(1.0 + ti.exp(-ti.abs(opacity_logit[i]))) + ti.max(-opacity_logit[i], 0.0)
-            splat[i, U], splat[i, V] = u, v
-            splat[i, QA], splat[i, QB], splat[i, QC] = 0.5 * qxx, qxy, 0.5 * qyy
-            splat[i, FADE], splat[i, Z], splat[i, INV_Z] = fade, x[2], inv_z
-            splat[i, ZU], splat[i, ZV] = mz.dot(bx), mz.dot(by)
-            for c in ti.static(range(3)):
-                splat[i, RED + c] = colour[i, c]
-                if ti.static(with_embedding):
-                    splat[i, EMBEDDING + c] = sigmoid(embedding[i, c])
-            reach = ti.max(2.0 * (REACH - fade), 0.0)  # Mahalanobis^2 where alpha has fallen to ALPHA_MIN
-            rx, ry = ti.sqrt(reach * cxx), ti.sqrt(reach * cyy)
-            if reach > 0.0 and u + rx >= 0 and u - rx <= width - 1 and v + ry >= 0 and v - ry <= height - 1:
-                x0 = ti.cast(ti.max(u - rx, 0.0), ti.i32) // TILE
-                x1 = ti.cast(ti.min(u + rx, width - 1.0), ti.i32) // TILE
-                y0 = ti.cast(ti.max(v - ry, 0.0), ti.i32) // TILE
-                y1 = ti.cast(ti.min(v + ry, height - 1.0), ti.i32) // TILE
-                tile_rect[i, 0], tile_rect[i, 1] = x0, x1
-                tile_rect[i, 2], tile_rect[i, 3] = y0, y1
-                tile_count[i] = (x1 - x0 + 1) * (y1 - y0 + 1)
+    if ti.static(ti.cfg.arch == ti.cuda):
+        for i in range(count):
+            point = in_camera(pose, row(i, mean, 3))
+            if point[2] > NEAR_M:
+                columns = splat_of(
+                    point, row(i, log_scale, 3), row(i, quat, 4), opacity_logit[i], pose, camera,
+                    ti.cast(width, ti.f32), ti.cast(height, ti.f32),
+                )  # fmt: skip
+                store_splat(i, columns, colour, embedding, with_embedding, splat, tile_rect, tile_count)
+            else:
+                store_tiles(i, [0, -1, 0, -1], tile_rect, tile_count)
+    else:
+        for block in range((count + LANES - 1) // LANES):
+            first = block * LANES
+            last = ti.min(first + LANES, count)
+            point = in_camera(pose, rows(first, count, mean, 3))
+            if lane_max(point[2]) > NEAR_M:
+                logit = Lanes(0.0)
+                for i in range(first, last):
+                    logit[i - first] = opacity_logit[i]
+                columns = splat_of(
+                    point, rows(first, count, log_scale, 3), rows(first, count, quat, 4), logit, pose, camera,
+                    ti.cast(width, ti.f32), ti.cast(height, ti.f32),
+                )  # fmt: skip
+                for i in range(first, last):
+                    of_one = [columns[k][i - first] for k in ti.static(range(_COLUMNS + 5))]
+                    store_splat(i, of_one, colour, embedding, with_embedding, splat, tile_rect, tile_count)
+            else:
+                for i in range(first, last):
+                    store_tiles(i, [0, -1, 0, -1], tile_rect, tile_count)
 
 
 @ti.func
-def gaussian_backward(
-    i,
-    mean: ti.template(),
-    log_scale: ti.template(),
-    quat: ti.template(),
-    opacity_logit: ti.template(),
-    embedding: ti.template(),
+def jacobian_gradient(g, focal, ratio, limited, inv_z):
+    """Gradients by x (or y) and by z of the Jacobian entry -limited focal / z, times g (constant where limited)."""
+    by_x = 0.0 - g * focal * inv_z * inv_z
+    by_z = 0.0 - by_x * limited
+    free = ratio == limited
+    return ti.select(free, by_x, filled(by_x, 0.0)), ti.select(free, by_z + by_z, by_z)
+
+
+@ti.func
+def quat_gradient(q: ti.template(), torque: ti.template()):
+    """2 q (0, torque): gradient by a unit quaternion, given that by a small turn about the Gaussian's own axes."""
+    w, x, y, z = q[0] + q[0], q[1] + q[1], q[2] + q[2], q[3] + q[3]
+    return [
+        0.0 - (x * torque[0] + y * torque[1] + z * torque[2]),
+        w * torque[0] + y * torque[2] - z * torque[1],
+        w * torque[1] + z * torque[0] - x * torque[2],
+        w * torque[2] + x * torque[1] - y * torque[0],
+    ]
+
+
+@ti.func
+def ellipse_gradient(ax, ay, mz, g: ti.template()):
+    """Gradients by the rows of A = J M and by mz, the z row of M, and by the centre in px; by half the log-scales.
+
+    With the inverse covariance Q, B = Q A and D = P A (Q with BLUR, P with BLUR_DEPTH) and the part of mz that the
+    depth slopes D mz leave, no term of a long splat is the small difference of large ones:
+    dQ = -Q dA B^T - B dA^T Q, d(slope) = P dA rest - D dA^T slope + D dmz
+    """
+    normal = cross(ax, ay)
+    to_x, to_y = cross(ay, normal), cross(normal, ax)  # B is small where A is large: no differences here either
+    area, xx, xy, yy = dot(normal, normal), dot(ax, ax), dot(ax, ay), dot(ay, ay)
+    inv_det = inverse_determinant(area, xx, yy, BLUR)
+    inv_depth_det = inverse_determinant(area, xx, yy, BLUR_DEPTH)
+    qxx, qxy, qyy = (yy + BLUR) * inv_det, (0.0 - xy) * inv_det, (xx + BLUR) * inv_det
+    bx, by = mixed(inv_det, to_x, BLUR * inv_det, ax), mixed(inv_det, to_y, BLUR * inv_det, ay)
+    blur = BLUR_DEPTH * inv_depth_det
+    dx, dy = mixed(inv_depth_det, to_x, blur, ax), mixed(inv_depth_det, to_y, blur, ay)
+    zu, zv = dot(mz, dx), dot(mz, dy)
+    rest = [mz[k] - zu * ax[k] - zv * ay[k] for k in ti.static(range(3))]
+    gxx, gxy, gyy = -0.5 * g[M_XX], -0.5 * g[M_XY], -0.5 * g[M_YY]
+    gbx, gby = mixed(gxx, bx, gxy, by), mixed(gxy, bx, gyy, by)
+    gzu, gzv = g[M_DEPTH_X], g[M_DEPTH_Y]
+    gmz = mixed(gzu, dx, gzv, dy)
+    by_x = ((yy + BLUR_DEPTH) * gzu - xy * gzv) * inv_depth_det
+    by_y = ((xx + BLUR_DEPTH) * gzv - xy * gzu) * inv_depth_det
+    gax = [by_x * rest[k] - zu * gmz[k] - 2.0 * (qxx * gbx[k] + qxy * gby[k]) for k in ti.static(range(3))]
+    gay = [by_y * rest[k] - zv * gmz[k] - 2.0 * (qxy * gbx[k] + qyy * gby[k]) for k in ti.static(range(3))]
+    gu = qxx * g[M_X] + qxy * g[M_Y] - zu * g[M_SLOPE]
+    gv = qxy * g[M_X] + qyy * g[M_Y] - zv * g[M_SLOPE]
+    # A's column k times its own gradient, and mz's, with what cancels left out
+    gs = [gmz[k] * rest[k] - gbx[k] * bx[k] - gby[k] * by[k] for k in ti.static(range(3))]
+    return gax, gay, gmz, gu, gv, gs
+
+
+@ti.func
+def gaussian_gradient(
+    mean,
+    log_scale,
+    quat,
+    opacity_logit,
+    g,  # moments, of which those up to M_SLOPE are used
     pose: ti.template(),
     camera: ti.template(),
     width,
     height,
+):
+    """Gradients of a Gaussian's mean, log-scale, quaternion and opacity logit, and its part of the pose's."""
+    fx, fy = camera[0], camera[1]
+    point = in_camera(pose, mean)
+    inv_norm = inverse_norm(quat)
+    q = [quat[k] * inv_norm for k in ti.static(range(4))]
+    axes = axes_in_camera(pose, q)
+    s = [exponential(log_scale[k]) for k in ti.static(range(3))]
+    inv_z = 1.0 / larger(point[2], filled(point[2], NEAR_M))
+    x, y = point[0] * inv_z, point[1] * inv_z
+    tx, ty = in_view(x, camera[2], fx, width), in_view(y, camera[3], fy, height)
+    j0, j1 = fx * inv_z, fy * inv_z
+    unit_x, unit_y = mixed(j0, axes[0], 0.0 - j0 * tx, axes[2]), mixed(j1, axes[1], 0.0 - j1 * ty, axes[2])
+    gax, gay, gmz, gu, gv, gs = ellipse_gradient(scaled(s, unit_x), scaled(s, unit_y), scaled(s, axes[2]), g)
+    # A turn about the Gaussian's own axes: the lengths of the axes themselves do not come in
+    to_x, to_y, to_z = scaled(s, gax), scaled(s, gay), scaled(s, gmz)
+    torque_x, torque_y, torque_z = cross(to_x, unit_x), cross(to_y, unit_y), cross(to_z, axes[2])
+    torque = [torque_x[k] + torque_y[k] + torque_z[k] for k in ti.static(range(3))]
+    # Rows of A = J M -> J -> the centre in the camera's frame
+    jx_by_x, jx_by_z = jacobian_gradient(dot(to_x, axes[2]), fx, x, tx, inv_z)
+    jy_by_y, jy_by_z = jacobian_gradient(dot(to_y, axes[2]), fy, y, ty, inv_z)
+    gz = g[M_DEPTH] - inv_z * (j0 * dot(to_x, axes[0]) + j1 * dot(to_y, axes[1]) + gu * fx * x + gv * fy * y)
+    gp = [gu * j0 + jx_by_x, gv * j1 + jy_by_y, gz + jx_by_z + jy_by_z]
+    lever = cross(point, gp)
+    gq = quat_gradient(q, torque)
+    by_mean = [pose[k] * gp[0] + pose[4 + k] * gp[1] + pose[8 + k] * gp[2] for k in ti.static(range(3))]
+    by_log_scale = [gs[k] + gs[k] for k in ti.static(range(3))]
+    by_quat = [gq[k] * inv_norm for k in ti.static(range(4))]
+    # Left perturbation of the pose: dx = w cross x + t, and the axes turn with w
+    turn = [lever[r] + dot(axes[r], torque) for r in ti.static(range(3))]
+    return by_mean + by_log_scale + by_quat + [g[M_0] * sigmoid(0.0 - opacity_logit)], turn + gp
+
+
+@ti.func
+def add_gradient(
+    i,
+    own: ti.template(),  # of `gaussian_gradient`
+    embedding: ti.template(),
     with_embedding: ti.template(),
     moments: ti.template(),
     grad_mean: ti.template(),
@@ -193,91 +410,22 @@ def gaussian_backward(
     grad_embedding: ti.template(),
     curvature: ti.template(),
 ):
-    """One Gaussian's part of `project_backward`; returns its part of the pose gradient.
-
-    Sums into arrays are written out, since `+=` on an array element is an atomic addition, on the CPU a locked loop.
-    """
-    # The forward quantities again
-    R = rotation_of_pose(pose)
-    x = R @ ti.Vector([mean[i, 0], mean[i, 1], mean[i, 2]]) + ti.Vector([pose[3], pose[7], pose[11]])
-    fx, fy = camera[0], camera[1]
-    raw = ti.Vector([quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3]])
-    inv_norm = 1.0 / raw.norm()
-    q = raw * inv_norm
-    Rq = rotation_from_quat(q[0], q[1], q[2], q[3])
-    s = ti.Vector([ti.exp(log_scale[i, k]) for k in range(3)])
-    M = axes_in_camera(R, Rq, s)
-    inv_z = 1.0 / x[2]
-    rx, ry = x[0] * inv_z, x[1] * inv_z
-    tx, ty = clamped(rx, camera[2], fx, width), clamped(ry, camera[3], fy, height)
-    j0, j1, jx, jy = fx * inv_z, fy * inv_z, -tx * fx * inv_z, -ty * fy * inv_z
-    mz = ti.Vector([M[2, 0], M[2, 1], M[2, 2]])
-    ax = ti.Vector([j0 * M[0, k] + jx * M[2, k] for k in range(3)])
-    ay = ti.Vector([j1 * M[1, k] + jy * M[2, k] for k in range(3)])
-    cxx, cxy, cyy = ax.dot(ax) + BLUR, ax.dot(ay), ay.dot(ay) + BLUR
-    inv_det = 1.0 / blurred_determinant(ax, ay, BLUR)
-    qxx, qxy, qyy = cyy * inv_det, -cxy * inv_det, cxx * inv_det
-    # Inverse covariance Q and depth slopes D mz -> rows of A = J M and the z row of M. With B = Q A and
-    # D = P A (Q with BLUR, P with BLUR_DEPTH) and the part of mz that the slopes leave, no term of a long
-    # splat is the small difference of large ones:
-    # dQ = -Q dA B^T - B dA^T Q, d(slope) = P dA rest - D dA^T slope + D dmz
-    bx, by = precision_times_rows(ax, ay, BLUR)
-    dx, dy = precision_times_rows(ax, ay, BLUR_DEPTH)
-    inv_depth_det = 1.0 / blurred_determinant(ax, ay, BLUR_DEPTH)
-    pxx, pxy, pyy = ay.dot(ay) + BLUR_DEPTH, -cxy, ax.dot(ax) + BLUR_DEPTH
-    zu, zv = mz.dot(dx), mz.dot(dy)
-    rest = mz - zu * ax - zv * ay
-    gz, gzu, gzv = moments[i, M_DEPTH], moments[i, M_DEPTH_X], moments[i, M_DEPTH_Y]
-    gu = qxx * moments[i, M_X] + qxy * moments[i, M_Y] - zu * moments[i, M_SLOPE]
-    gv = qxy * moments[i, M_X] + qyy * moments[i, M_Y] - zv * moments[i, M_SLOPE]
-    gxx, gxy, gyy = -0.5 * moments[i, M_XX], -0.5 * moments[i, M_XY], -0.5 * moments[i, M_YY]
-    gbx, gby = gxx * bx + gxy * by, gxy * bx + gyy * by
-    gmz = gzu * dx + gzv * dy
-    gax = (pxx * gzu + pxy * gzv) * inv_depth_det * rest - zu * gmz - 2.0 * (qxx * gbx + qxy * gby)
-    gay = (pxy * gzu + pyy * gzv) * inv_depth_det * rest - zv * gmz - 2.0 * (qxy * gbx + qyy * gby)
-    # Rows of A = J M -> J and M
-    m0 = ti.Vector([M[0, 0], M[0, 1], M[0, 2]])
-    m1 = ti.Vector([M[1, 0], M[1, 1], M[1, 2]])
-    gj0, gj1, gjx, gjy = gax.dot(m0), gay.dot(m1), gax.dot(mz), gay.dot(mz)
-    gm0, gm1, gm2 = j0 * gax, j1 * gay, jx * gax + jy * gay + gmz
-    # Camera-frame centre
-    inv_z2 = inv_z * inv_z
-    gx, gy = gu * j0, gv * j1
-    gzc = gz - (gu * fx * rx + gv * fy * ry) * inv_z - (gj0 * fx + gj1 * fy) * inv_z2
-    jx_by_x, jx_by_z = jacobian_gradient(gjx, fx, rx, tx, inv_z2)
-    jy_by_y, jy_by_z = jacobian_gradient(gjy, fy, ry, ty, inv_z2)
-    gp = ti.Vector([gx + jx_by_x, gy + jy_by_y, gzc + jx_by_z + jy_by_z])
-    gw = R.transpose() @ gp
-    for c in ti.static(range(3)):
-        grad_mean[i, c] = grad_mean[i, c] + gw[c]
-    # Left perturbation: dx = w cross x + t, dM = [w] M
-    turn = x.cross(gp)
+    """Add a Gaussian's gradients to the arrays, in full, since `+=` on an array element is an atomic addition."""
     for k in ti.static(range(3)):
-        turn += ti.Vector([M[0, k], M[1, k], M[2, k]]).cross(ti.Vector([gm0[k], gm1[k], gm2[k]]))
-    # M = R Rq S
-    H = R.transpose() @ ti.Matrix.rows([gm0, gm1, gm2])
-    for k in ti.static(range(3)):
-        for r in ti.static(range(3)):
-            H[r, k] *= s[k]
-        # A's column k times its own gradient, and mz's, with what cancels left out
-        gs = gmz[k] * rest[k] - gbx[k] * bx[k] - gby[k] * by[k]
-        grad_log_scale[i, k] = grad_log_scale[i, k] + 2.0 * gs
-    gq = quat_gradient(H, q)
-    gq = (gq - q * gq.dot(q)) * inv_norm
-    for k in ti.static(range(4)):
-        grad_quat[i, k] = grad_quat[i, k] + gq[k]
-    grad_opacity_logit[i] = grad_opacity_logit[i] + moments[i, M_0] * sigmoid(-opacity_logit[i])
-    for k in ti.static(range(3)):
+        grad_mean[i, k] = grad_mean[i, k] + own[k]
+        grad_log_scale[i, k] = grad_log_scale[i, k] + own[3 + k]
         grad_colour[i, k] = grad_colour[i, k] + moments[i, M_RED + k]
         if ti.static(with_embedding):
             e = sigmoid(embedding[i, k])
             grad_embedding[i, k] = grad_embedding[i, k] + moments[i, M_EMBEDDING + k] * e * (1.0 - e)
+    for k in ti.static(range(4)):
+        grad_quat[i, k] = grad_quat[i, k] + own[6 + k]
+    grad_opacity_logit[i] = grad_opacity_logit[i] + own[10]
     curvature[i, 0] = curvature[i, 0] + moments[i, M_CURVATURE_COLOUR]
     curvature[i, 1] = curvature[i, 1] + moments[i, M_CURVATURE_DEPTH]
-    return ti.Vector([turn[0], turn[1], turn[2], gp[0], gp[1], gp[2]])
 
 
-@ti.kernel
+@lanes_kernel
 def project_backward(
     count: ti.i32,
     mean: nd(ti.f32, ndim=2),  # [N, 3] m, world
@@ -303,18 +451,24 @@ def project_backward(
 ):
     """Moments of the splats -> gradients of the Gaussians' parameters and of the pose.
 
-    A row of the pose's gradient is summed by one thread on the CPU, by one warp under CUDA, in a fixed order.
+    A row of the pose's gradient is summed lane by lane by one thread on the CPU, by one warp under CUDA, in a fixed order.
     """
+    w, h = ti.cast(width, ti.f32), ti.cast(height, ti.f32)
     if ti.static(ti.cfg.arch == ti.cuda):
         ti.loop_config(block_dim=128)  # a Gaussian takes many registers
         for i in range(grad_pose.shape[0] * POSE_BLOCK):
-            part = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+            part = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
             if i < count:
                 if tile_count[i] > 0:
-                    part = gaussian_backward(
-                        i, mean, log_scale, quat, opacity_logit, embedding, pose, camera, width, height,
-                        with_embedding, moments, grad_mean, grad_log_scale, grad_quat, grad_opacity_logit, grad_colour,
-                        grad_embedding, curvature,
+                    own, pose_part = gaussian_gradient(
+                        row(i, mean, 3), row(i, log_scale, 3), row(i, quat, 4), opacity_logit[i],
+                        row(i, moments, M_SLOPE + 1), pose, camera, w, h,
+                    )  # fmt: skip
+                    for c in ti.static(range(6)):
+                        part[c] = pose_part[c]
+                    add_gradient(
+                        i, own, embedding, with_embedding, moments, grad_mean, grad_log_scale, grad_quat,
+                        grad_opacity_logit, grad_colour, grad_embedding, curvature,
                     )  # fmt: skip
             for c in ti.static(range(6)):
                 total = warp_sum(part[c])
@@ -322,13 +476,28 @@ def project_backward(
                     grad_pose[i // POSE_BLOCK, c] = total
     else:
         for block in range(grad_pose.shape[0]):
-            pose_sum = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-            for i in range(block * POSE_BLOCK, ti.min((block + 1) * POSE_BLOCK, count)):
-                if tile_count[i] > 0:
-                    pose_sum += gaussian_backward(
-                        i, mean, log_scale, quat, opacity_logit, embedding, pose, camera, width, height,
-                        with_embedding, moments, grad_mean, grad_log_scale, grad_quat, grad_opacity_logit, grad_colour,
-                        grad_embedding, curvature,
+            total = [0.0 for c in ti.static(range(6))]
+            for half in range(POSE_BLOCK // LANES):
+                first = block * POSE_BLOCK + half * LANES
+                last = ti.min(first + LANES, count)
+                drawn = 0
+                logit = Lanes(0.0)
+                for i in range(first, last):
+                    drawn = ti.max(drawn, tile_count[i])
+                    logit[i - first] = opacity_logit[i]
+                if drawn > 0:
+                    own, pose_part = gaussian_gradient(
+                        rows(first, count, mean, 3), rows(first, count, log_scale, 3), rows(first, count, quat, 4),
+                        logit, rows(first, count, moments, M_SLOPE + 1), pose, camera, w, h,
                     )  # fmt: skip
+                    for i in range(first, last):
+                        if tile_count[i] > 0:
+                            for c in ti.static(range(6)):
+                                total[c] += pose_part[c][i - first]
+                            add_gradient(
+                                i, [own[c][i - first] for c in ti.static(range(11))], embedding, with_embedding,
+                                moments, grad_mean, grad_log_scale, grad_quat, grad_opacity_logit, grad_colour,
+                                grad_embedding, curvature,
+                            )  # fmt: skip
             for c in ti.static(range(6)):
-                grad_pose[block, c] = pose_sum[c]
+                grad_pose[block, c] = total[c]

@@ -27,6 +27,10 @@ _EXP_RANGE = 5.6  # a little beyond REACH: what is cut there is below the thresh
 # exp(-x), 0 <= x <= 0.7, to 8e-8 relative: Lawson's iteratively reweighted least squares
 _EXP = (0.999999921, -0.99999254, 0.499882589, -0.165973979, 0.0397725646, -0.00584676082)
 _EXP_8TH = tuple(c / 8.0**k for k, c in enumerate(_EXP))
+# 2^x, |x| <= 0.5, to 1.6e-8 relative, likewise
+_EXP2 = (1.0, 0.693147182, 0.240226462, 0.0555032864, 0.00961848907, 0.00133999309, 0.000153458124)
+_LOG2_E = 1.0 / math.log(2.0)
+_EXPONENT_BITS = 7  # of powers of two from 2^-64 to 2^63
 
 Lanes = ti.types.vector(LANES, ti.f32)
 LANE_X = tuple(float(j % CHUNK) for j in range(LANES))  # px, of a lane's pixel in its chunk
@@ -81,6 +85,58 @@ def at_least(x, bound: ti.template()):
         return larger(x, Lanes(bound))
     else:
         return larger(x, bound)
+
+
+@ti.func
+def filled(like, value):
+    """The scalar `value` in the form of `like`, a scalar or Lanes."""
+    if ti.static(_is_vector(like)):
+        return Lanes(value)
+    else:
+        return value
+
+
+@ti.func
+def indicator(a, b):
+    """1 where a < b, else 0."""
+    return ti.select(a < b, filled(a, 1.0), filled(a, 0.0))
+
+
+@ti.func
+def magnitude(x):
+    """|x|."""
+    return larger(x, 0.0 - x)
+
+
+@ti.func
+def held(x, low, high):
+    """x inside [low, high], which are scalars; `low` if it is no number."""
+    return smaller(larger(x, filled(x, low)), filled(x, high))
+
+
+@ti.func
+def exponential(x):
+    """exp(x) for scalars and Lanes alike; of Lanes |x| <= 44 (beyond, that of the limit), to the rounding of x.
+
+    For Lanes 2^f 2^n with whole n, the second factor from n's binary digits, since they have no bit patterns.
+    """
+    if ti.static(not _is_vector(x)):
+        return ti.exp(x)
+    else:
+        y = held(x * _LOG2_E, -64.0, 63.0)
+        n = ti.floor(y + 0.5)
+        f = y - n
+        ff = f * f
+        power = (
+            _EXP2[0] + f * _EXP2[1] + ff * (_EXP2[2] + f * _EXP2[3] + ff * (_EXP2[4] + f * _EXP2[5] + ff * _EXP2[6]))
+        )
+        power *= 2.0**-64
+        n += 64.0
+        for bit in ti.static(range(_EXPONENT_BITS)):
+            step = ti.static(float(1 << (_EXPONENT_BITS - 1 - bit)))
+            power *= ti.select(n < Lanes(step), Lanes(1.0), Lanes(2.0**step))
+            n = ti.select(n < Lanes(step), n, n - step)
+        return power
 
 
 @ti.func
