@@ -3,8 +3,8 @@
 A splat is what the rasterizer needs of a Gaussian: centre, inverse covariance, opacity, tangent-plane depth, colour.
 Columns of a splat row, and of the moments that the rasterizer's backward pass sums for it, are the constants below.
 
-The functions take scalars and Lanes alike: a CUDA thread works on one Gaussian, the CPU on 16 at once. Vectors are lists
-of components (matrices lists of rows) that Taichi takes apart when it translates.
+The functions take scalars and Lanes alike: a CUDA thread works on one Gaussian, the CPU on 16 at once. Their vectors are
+lists of components (matrices lists of rows), which Taichi takes apart when it translates.
 """
 
 import taichi as ti
@@ -16,13 +16,8 @@ from tgslam.kernels.simd import (
     TILE,
     Lanes,
     exponential,
-    filled,
-    held,
-    indicator,
     lane_max,
     lanes_kernel,
-    larger,
-    magnitude,
 )
 
 nd = ti.types.ndarray
@@ -49,18 +44,17 @@ _LOG = (2.0, 0.66666317, 0.400249094, 0.279606044, 0.281783342)
 @ti.func
 def sigmoid(x):
     """Logistic function, stable for both signs."""
-    e = exponential(0.0 - magnitude(x))
-    share = 1.0 / (1.0 + e)
-    return ti.select(x < filled(x, 0.0), e * share, share)
+    e = exponential(ti.min(x, 0.0 - x))
+    return ti.select(x < 0.0, e, 1.0) / (1.0 + e)
 
 
 @ti.func
 def softplus(x):
     """log(1 + exp(x)), stable for both signs."""
-    e = exponential(0.0 - magnitude(x))
+    e = exponential(ti.min(x, 0.0 - x))
     t = e / (2.0 + e)
     tt = t * t
-    return larger(x, filled(x, 0.0)) + t * (_LOG[0] + tt * (_LOG[1] + tt * (_LOG[2] + tt * (_LOG[3] + tt * _LOG[4]))))
+    return ti.max(x, 0.0) + t * (_LOG[0] + tt * (_LOG[1] + tt * (_LOG[2] + tt * (_LOG[3] + tt * _LOG[4]))))
 
 
 @ti.func
@@ -119,8 +113,9 @@ def inverse_norm(q: ti.template()):
 @ti.func
 def in_view(ratio, centre, focal, size):
     """x/z (or y/z) limited to EDGE half-images, so that the linearisation stays sane beside the camera."""
-    margin = 0.5 * (EDGE - 1.0)
-    return held(ratio, (-margin * size - centre) / focal, ((1.0 + margin) * size - centre) / focal)
+    low = (-0.5 * (EDGE - 1.0) * size - centre) / focal
+    high = ((0.5 + 0.5 * EDGE) * size - centre) / focal
+    return ti.min(ti.max(ratio, low), high)
 
 
 @ti.func
@@ -145,12 +140,11 @@ def inverse_determinant(area, xx, yy, blur):
 
 
 @ti.func
-def rows_of_tiles(centre, radius, size):
-    """First and last row (or column) of tiles that [centre - radius, centre + radius] px touches, and 1 if any."""
-    low, high = centre - radius, centre + radius
-    first = ti.floor(held(low, 0.0, size - 1.0) * (1.0 / TILE))
-    last = ti.floor(held(high, 0.0, size - 1.0) * (1.0 / TILE))
-    return first, last, (1.0 - indicator(high, filled(high, 0.0))) * (1.0 - indicator(filled(low, size - 1.0), low))
+def touched(centre, radius, last_px):
+    """First row (or column) of tiles that [centre - radius, centre + radius] px touches, and the one after the last."""
+    low, high = ti.max(centre - radius, 0.0), ti.min(centre + radius, last_px)
+    end = ti.floor(high * (1.0 / TILE)) + 1.0
+    return ti.select(low <= high, ti.floor(low * (1.0 / TILE)), 0.0), ti.select(low <= high, end, 0.0)
 
 
 @ti.func
@@ -164,13 +158,13 @@ def splat_of(
     width,
     height,
 ):
-    """A splat's columns, then the first and last tile in x and in y (last < first: none), in whole floats."""
+    """A splat's columns, then the tiles it touches, in whole floats: x from, to before, y from, to before."""
     fx, fy = camera[0], camera[1]
     inv_norm = inverse_norm(quat)
     q = [quat[k] * inv_norm for k in ti.static(range(4))]
     axes = axes_in_camera(pose, q)
     s = [exponential(log_scale[k]) for k in ti.static(range(3))]
-    z = larger(point[2], filled(point[2], NEAR_M))  # what lies nearer is not drawn, but stays finite
+    z = ti.max(point[2], NEAR_M)  # what lies nearer is not drawn, but stays finite
     inv_z = 1.0 / z
     x, y = point[0] * inv_z, point[1] * inv_z
     j0, j1 = fx * inv_z, fy * inv_z
@@ -187,14 +181,12 @@ def splat_of(
     u, v = fx * x + camera[2], fy * y + camera[3]
     fade = softplus(0.0 - opacity_logit)
     reach = 2.0 * (REACH - fade)  # Mahalanobis^2 where alpha has fallen to ALPHA_MIN
-    seen = indicator(filled(reach, 0.0), reach) * indicator(filled(z, NEAR_M), point[2])
-    reach = larger(reach, filled(reach, 0.0))
-    x0, x1, seen_x = rows_of_tiles(u, ti.sqrt(reach * cxx), width)
-    y0, y1, seen_y = rows_of_tiles(v, ti.sqrt(reach * cyy), height)
-    seen *= seen_x * seen_y
+    drawn = ti.min(reach, point[2] - NEAR_M) > 0.0
+    reach = ti.max(reach, 0.0)
+    x0, x1 = touched(u, ti.sqrt(reach * cxx), ti.select(drawn, width - 1.0, -1.0))
+    y0, y1 = touched(v, ti.sqrt(reach * cyy), ti.select(drawn, height - 1.0, -1.0))
     return [
-        u, v, 0.5 * cyy * inv_det, (0.0 - xy) * inv_det, 0.5 * cxx * inv_det, fade, z, zu, zv, inv_z,
-        seen * x0, seen * (x1 + 1.0) - 1.0, seen * y0, seen * (y1 + 1.0) - 1.0,
+        u, v, 0.5 * cyy * inv_det, (0.0 - xy) * inv_det, 0.5 * cxx * inv_det, fade, z, zu, zv, inv_z, x0, x1, y0, y1
     ]  # fmt: skip
 
 
@@ -209,7 +201,7 @@ def store_splat(
     tile_rect: ti.template(),
     tile_count: ti.template(),
 ):
-    """Write what `splat_of` made of a Gaussian."""
+    """Write what `splat_of` made of a Gaussian, with its colours."""
     for k in ti.static(range(_COLUMNS)):
         splat[i, k] = columns[k]
     splat[i, INV_Z] = columns[_COLUMNS]
@@ -217,15 +209,10 @@ def store_splat(
         splat[i, RED + c] = colour[i, c]
         if ti.static(with_embedding):
             splat[i, EMBEDDING + c] = sigmoid(embedding[i, c])
-    store_tiles(i, [ti.cast(columns[_COLUMNS + 1 + k], ti.i32) for k in ti.static(range(4))], tile_rect, tile_count)
-
-
-@ti.func
-def store_tiles(i, rect: ti.template(), tile_rect: ti.template(), tile_count: ti.template()):
-    """Write the tiles that a Gaussian touches."""
-    for k in ti.static(range(4)):
-        tile_rect[i, k] = rect[k]
-    tile_count[i] = (rect[1] - rect[0] + 1) * (rect[3] - rect[2] + 1)
+    x0, x1 = ti.cast(columns[_COLUMNS + 1], ti.i32), ti.cast(columns[_COLUMNS + 2], ti.i32)
+    y0, y1 = ti.cast(columns[_COLUMNS + 3], ti.i32), ti.cast(columns[_COLUMNS + 4], ti.i32)
+    tile_rect[i, 0], tile_rect[i, 1], tile_rect[i, 2], tile_rect[i, 3] = x0, x1 - 1, y0, y1 - 1
+    tile_count[i] = (x1 - x0) * (y1 - y0)
 
 
 @ti.func
@@ -245,6 +232,22 @@ def rows(first, count, array: ti.template(), columns: ti.template()):
     return result
 
 
+@ti.func
+def shapes(first, count, log_scale: ti.template(), quat: ti.template(), opacity_logit: ti.template()):
+    """The same of what makes a Gaussian's shape: three, four and one column."""
+    scales = [Lanes(0.0) for k in ti.static(range(3))]
+    turns = [Lanes(0.0) for k in ti.static(range(4))]
+    logit = Lanes(0.0)
+    for j in range(LANES):
+        i = ti.min(first + j, count - 1)
+        for k in ti.static(range(3)):
+            scales[k][j] = log_scale[i, k]
+        for k in ti.static(range(4)):
+            turns[k][j] = quat[i, k]
+        logit[j] = opacity_logit[i]
+    return scales, turns, logit
+
+
 @lanes_kernel
 def project(
     count: ti.i32,
@@ -260,40 +263,33 @@ def project(
     height: ti.i32,
     with_embedding: ti.template(),
     splat: nd(ti.f32, ndim=2),  # [N, SPLAT] out
-    tile_rect: nd(ti.i32, ndim=2),  # [N, 4] out: first and last tile in x, then in y; empty: first > last
+    tile_rect: nd(ti.i32, ndim=2),  # [N, 4] out where touched: first and last tile in x, then in y
     tile_count: nd(ti.i32, ndim=1),  # [N] out: tiles touched
 ):
     """Gaussians -> splats and the tiles that their alpha >= 1/255 box touches (Zwicker's EWA, as 3DGS)."""
+    w, h = ti.cast(width, ti.f32), ti.cast(height, ti.f32)
     if ti.static(ti.cfg.arch == ti.cuda):
         for i in range(count):
             point = in_camera(pose, row(i, mean, 3))
+            tile_count[i] = 0
             if point[2] > NEAR_M:
                 columns = splat_of(
-                    point, row(i, log_scale, 3), row(i, quat, 4), opacity_logit[i], pose, camera,
-                    ti.cast(width, ti.f32), ti.cast(height, ti.f32),
+                    point, row(i, log_scale, 3), row(i, quat, 4), opacity_logit[i], pose, camera, w, h
                 )  # fmt: skip
                 store_splat(i, columns, colour, embedding, with_embedding, splat, tile_rect, tile_count)
-            else:
-                store_tiles(i, [0, -1, 0, -1], tile_rect, tile_count)
     else:
         for block in range((count + LANES - 1) // LANES):
-            first = block * LANES
-            last = ti.min(first + LANES, count)
+            first, after = block * LANES, ti.min(block * LANES + LANES, count)
             point = in_camera(pose, rows(first, count, mean, 3))
             if lane_max(point[2]) > NEAR_M:
-                logit = Lanes(0.0)
-                for i in range(first, last):
-                    logit[i - first] = opacity_logit[i]
-                columns = splat_of(
-                    point, rows(first, count, log_scale, 3), rows(first, count, quat, 4), logit, pose, camera,
-                    ti.cast(width, ti.f32), ti.cast(height, ti.f32),
-                )  # fmt: skip
-                for i in range(first, last):
+                scales, turns, logit = shapes(first, count, log_scale, quat, opacity_logit)
+                columns = splat_of(point, scales, turns, logit, pose, camera, w, h)
+                for i in range(first, after):
                     of_one = [columns[k][i - first] for k in ti.static(range(_COLUMNS + 5))]
                     store_splat(i, of_one, colour, embedding, with_embedding, splat, tile_rect, tile_count)
             else:
-                for i in range(first, last):
-                    store_tiles(i, [0, -1, 0, -1], tile_rect, tile_count)
+                for i in range(first, after):
+                    tile_count[i] = 0
 
 
 @ti.func
@@ -302,7 +298,7 @@ def jacobian_gradient(g, focal, ratio, limited, inv_z):
     by_x = 0.0 - g * focal * inv_z * inv_z
     by_z = 0.0 - by_x * limited
     free = ratio == limited
-    return ti.select(free, by_x, filled(by_x, 0.0)), ti.select(free, by_z + by_z, by_z)
+    return ti.select(free, by_x, 0.0), ti.select(free, by_z + by_z, by_z)
 
 
 @ti.func
@@ -370,7 +366,7 @@ def gaussian_gradient(
     q = [quat[k] * inv_norm for k in ti.static(range(4))]
     axes = axes_in_camera(pose, q)
     s = [exponential(log_scale[k]) for k in ti.static(range(3))]
-    inv_z = 1.0 / larger(point[2], filled(point[2], NEAR_M))
+    inv_z = 1.0 / ti.max(point[2], NEAR_M)
     x, y = point[0] * inv_z, point[1] * inv_z
     tx, ty = in_view(x, camera[2], fx, width), in_view(y, camera[3], fy, height)
     j0, j1 = fx * inv_z, fy * inv_z
@@ -451,7 +447,7 @@ def project_backward(
 ):
     """Moments of the splats -> gradients of the Gaussians' parameters and of the pose.
 
-    A row of the pose's gradient is summed lane by lane by one thread on the CPU, by one warp under CUDA, in a fixed order.
+    A row of the pose's gradient is summed by one thread on the CPU, by one warp under CUDA, in a fixed order.
     """
     w, h = ti.cast(width, ti.f32), ti.cast(height, ti.f32)
     if ti.static(ti.cfg.arch == ti.cuda):
@@ -479,18 +475,17 @@ def project_backward(
             total = [0.0 for c in ti.static(range(6))]
             for half in range(POSE_BLOCK // LANES):
                 first = block * POSE_BLOCK + half * LANES
-                last = ti.min(first + LANES, count)
+                after = ti.min(first + LANES, count)
                 drawn = 0
-                logit = Lanes(0.0)
-                for i in range(first, last):
-                    drawn = ti.max(drawn, tile_count[i])
-                    logit[i - first] = opacity_logit[i]
+                for i in range(first, after):
+                    drawn += tile_count[i]
                 if drawn > 0:
+                    scales, turns, logit = shapes(first, count, log_scale, quat, opacity_logit)
                     own, pose_part = gaussian_gradient(
-                        rows(first, count, mean, 3), rows(first, count, log_scale, 3), rows(first, count, quat, 4),
-                        logit, rows(first, count, moments, M_SLOPE + 1), pose, camera, w, h,
+                        rows(first, count, mean, 3), scales, turns, logit, rows(first, count, moments, M_SLOPE + 1),
+                        pose, camera, w, h,
                     )  # fmt: skip
-                    for i in range(first, last):
+                    for i in range(first, after):
                         if tile_count[i] > 0:
                             for c in ti.static(range(6)):
                                 total[c] += pose_part[c][i - first]

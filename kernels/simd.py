@@ -30,7 +30,6 @@ _EXP_8TH = tuple(c / 8.0**k for k, c in enumerate(_EXP))
 # 2^x, |x| <= 0.5, to 1.6e-8 relative, likewise
 _EXP2 = (1.0, 0.693147182, 0.240226462, 0.0555032864, 0.00961848907, 0.00133999309, 0.000153458124)
 _LOG2_E = 1.0 / math.log(2.0)
-_EXPONENT_BITS = 7  # of powers of two from 2^-64 to 2^63
 
 Lanes = ti.types.vector(LANES, ti.f32)
 LANE_X = tuple(float(j % CHUNK) for j in range(LANES))  # px, of a lane's pixel in its chunk
@@ -88,33 +87,6 @@ def at_least(x, bound: ti.template()):
 
 
 @ti.func
-def filled(like, value):
-    """The scalar `value` in the form of `like`, a scalar or Lanes."""
-    if ti.static(_is_vector(like)):
-        return Lanes(value)
-    else:
-        return value
-
-
-@ti.func
-def indicator(a, b):
-    """1 where a < b, else 0."""
-    return ti.select(a < b, filled(a, 1.0), filled(a, 0.0))
-
-
-@ti.func
-def magnitude(x):
-    """|x|."""
-    return larger(x, 0.0 - x)
-
-
-@ti.func
-def held(x, low, high):
-    """x inside [low, high], which are scalars; `low` if it is no number."""
-    return smaller(larger(x, filled(x, low)), filled(x, high))
-
-
-@ti.func
 def exponential(x):
     """exp(x) for scalars and Lanes alike; of Lanes |x| <= 44 (beyond, that of the limit), to the rounding of x.
 
@@ -123,19 +95,20 @@ def exponential(x):
     if ti.static(not _is_vector(x)):
         return ti.exp(x)
     else:
-        y = held(x * _LOG2_E, -64.0, 63.0)
+        y = ti.max(ti.min(x * _LOG2_E, 63.0), -64.0)
         n = ti.floor(y + 0.5)
         f = y - n
-        ff = f * f
-        power = (
-            _EXP2[0] + f * _EXP2[1] + ff * (_EXP2[2] + f * _EXP2[3] + ff * (_EXP2[4] + f * _EXP2[5] + ff * _EXP2[6]))
-        )
+        power = _EXP2[5] + f * _EXP2[6]
+        for k in ti.static(range(5)):
+            power = _EXP2[4 - k] + f * power
         power *= 2.0**-64
         n += 64.0
-        for bit in ti.static(range(_EXPONENT_BITS)):
-            step = ti.static(float(1 << (_EXPONENT_BITS - 1 - bit)))
-            power *= ti.select(n < Lanes(step), Lanes(1.0), Lanes(2.0**step))
-            n = ti.select(n < Lanes(step), n, n - step)
+        digit, factor = 64.0, 2.0**64
+        for _ in range(7):
+            power *= ti.select(n < digit, 1.0, factor)
+            n = ti.select(n < digit, n, n - digit)
+            digit *= 0.5
+            factor = ti.sqrt(factor)
         return power
 
 
