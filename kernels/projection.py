@@ -3,8 +3,8 @@
 A splat is what the rasterizer needs of a Gaussian: centre, inverse covariance, opacity, tangent-plane depth, colour.
 Columns of a splat row, and of the moments that the rasterizer's backward pass sums for it, are the constants below.
 
-The functions take scalars and Lanes alike: a CUDA thread works on one Gaussian, the CPU on 16 at once. Their vectors are
-lists of components (matrices lists of rows), which Taichi takes apart when it translates.
+The functions take scalars and Lanes alike: a CUDA thread works on one Gaussian, the CPU on 16 at once. Vectors are
+lists of components (matrices: lists of rows), which Taichi takes apart when it translates.
 """
 
 import taichi as ti
@@ -16,7 +16,6 @@ from tgslam.kernels.simd import (
     TILE,
     Lanes,
     exponential,
-    lane_max,
     lanes_kernel,
 )
 
@@ -86,21 +85,30 @@ def cross(a: ti.template(), b: ti.template()):
 
 
 @ti.func
-def in_camera(pose: ti.template(), mean: ti.template()):
+def combined(a, u: ti.template(), b, v: ti.template(), c, w: ti.template()):
+    """a u + b v + c w"""
+    return [a * u[k] + b * v[k] + c * w[k] for k in ti.static(range(3))]
+
+
+@ti.func
+def in_camera(pose: ti.template(), mean):
     """The centre in the camera's frame; T_cw is stored row by row as [R | t]."""
+    x, y, z = mean
     return [
-        pose[4 * r] * mean[0] + pose[4 * r + 1] * mean[1] + pose[4 * r + 2] * mean[2] + pose[4 * r + 3]
-        for r in ti.static(range(3))
+        pose[0] * x + pose[1] * y + pose[2] * z + pose[3],
+        pose[4] * x + pose[5] * y + pose[6] * z + pose[7],
+        pose[8] * x + pose[9] * y + pose[10] * z + pose[11],
     ]
 
 
 @ti.func
 def axes_in_camera(pose: ti.template(), q: ti.template()):
     """R Rq, whose columns are the Gaussian's axes in the camera's frame, as a list of rows."""
-    Rq = rotation_rows(q[0], q[1], q[2], q[3])
+    x, y, z = rotation_rows(q[0], q[1], q[2], q[3])
     return [
-        [pose[4 * r] * Rq[0][k] + pose[4 * r + 1] * Rq[1][k] + pose[4 * r + 2] * Rq[2][k] for k in ti.static(range(3))]
-        for r in ti.static(range(3))
+        combined(pose[0], x, pose[1], y, pose[2], z),
+        combined(pose[4], x, pose[5], y, pose[6], z),
+        combined(pose[8], x, pose[9], y, pose[10], z),
     ]
 
 
@@ -281,7 +289,10 @@ def project(
         for block in range((count + LANES - 1) // LANES):
             first, after = block * LANES, ti.min(block * LANES + LANES, count)
             point = in_camera(pose, rows(first, count, mean, 3))
-            if lane_max(point[2]) > NEAR_M:
+            before = 0  # any of them is before the camera
+            for j in range(LANES):
+                before = ti.select(point[2][j] > NEAR_M, 1, before)
+            if before == 1:
                 scales, turns, logit = shapes(first, count, log_scale, quat, opacity_logit)
                 columns = splat_of(point, scales, turns, logit, pose, camera, w, h)
                 for i in range(first, after):

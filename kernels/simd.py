@@ -27,8 +27,8 @@ _EXP_RANGE = 5.6  # a little beyond REACH: what is cut there is below the thresh
 # exp(-x), 0 <= x <= 0.7, to 8e-8 relative: Lawson's iteratively reweighted least squares
 _EXP = (0.999999921, -0.99999254, 0.499882589, -0.165973979, 0.0397725646, -0.00584676082)
 _EXP_8TH = tuple(c / 8.0**k for k, c in enumerate(_EXP))
-# 2^x, |x| <= 0.5, to 1.6e-8 relative, likewise
-_EXP2 = (1.0, 0.693147182, 0.240226462, 0.0555032864, 0.00961848907, 0.00133999309, 0.000153458124)
+# 2^x - 1, |x| <= 0.5, by its powers, to 1.6e-8 relative, likewise
+_E1, _E2, _E3, _E4, _E5, _E6 = 0.693147182, 0.240226462, 0.0555032864, 0.00961848907, 0.00133999309, 0.000153458124
 _LOG2_E = 1.0 / math.log(2.0)
 
 Lanes = ti.types.vector(LANES, ti.f32)
@@ -98,10 +98,9 @@ def exponential(x):
         y = ti.max(ti.min(x * _LOG2_E, 63.0), -64.0)
         n = ti.floor(y + 0.5)
         f = y - n
-        power = _EXP2[5] + f * _EXP2[6]
-        for k in ti.static(range(5)):
-            power = _EXP2[4 - k] + f * power
-        power *= 2.0**-64
+        ff = f * f
+        high = _E4 + f * _E5 + ff * _E6
+        power = 2.0**-64 * (1.0 + f * _E1 + ff * (_E2 + f * _E3 + ff * high))
         n += 64.0
         digit, factor = 64.0, 2.0**64
         for _ in range(7):
