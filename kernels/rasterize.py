@@ -51,20 +51,22 @@ def count_slots(
     order: nd(ti.i32, ndim=1),  # [visible] Gaussian indices by depth, ties by index
     tile_rect: nd(ti.i32, ndim=2),  # [N, 4]
     tiles_x: ti.i32,
-    per_tile: nd(ti.i32, ndim=2),  # [tiles, SEGMENTS] out
+    per_tile: nd(ti.i32, ndim=2),  # [SEGMENTS, tiles] out: a row each, since threads that share cache lines wait
 ):
     """How many splats of each segment of the order touch each tile."""
     for spread in range(SEGMENTS * _THREAD_STEP):
         segment = spread // _THREAD_STEP
         if spread - segment * _THREAD_STEP == 0:
-            for tile in range(per_tile.shape[0]):
-                per_tile[tile, segment] = 0
+            for tile in range(per_tile.shape[1]):
+                per_tile[segment, tile] = 0
             for o in range(segment * visible // SEGMENTS, (segment + 1) * visible // SEGMENTS):
                 i = order[o]
-                for ty in range(tile_rect[i, 2], tile_rect[i, 3] + 1):
-                    for tx in range(tile_rect[i, 0], tile_rect[i, 1] + 1):
-                        tile = ty * tiles_x + tx
-                        per_tile[tile, segment] = per_tile[tile, segment] + 1  # `+=` would be atomic, and slow
+                x0, x1, y0, y1 = tile_rect[i, 0], tile_rect[i, 1], tile_rect[i, 2], tile_rect[i, 3]
+                tile, left = y0 * tiles_x + x0, x1 - x0
+                for _ in range((x1 - x0 + 1) * (y1 - y0 + 1)):
+                    per_tile[segment, tile] = per_tile[segment, tile] + 1  # `+=` would be atomic, and slow
+                    tile += ti.select(left == 0, tiles_x - (x1 - x0), 1)
+                    left = ti.select(left == 0, x1 - x0, left - 1)
 
 
 @ti.kernel
@@ -73,7 +75,7 @@ def fill_slots(
     order: nd(ti.i32, ndim=1),  # [visible] Gaussian indices by depth, ties by index
     tile_rect: nd(ti.i32, ndim=2),  # [N, 4]
     tiles_x: ti.i32,
-    cursor: nd(ti.i32, ndim=2),  # [tiles, SEGMENTS] first slot of each tile and segment; advanced
+    cursor: nd(ti.i32, ndim=2),  # [SEGMENTS, tiles] first slot of each tile and segment; advanced
     first_of: nd(ti.i32, ndim=1),  # [N] first entry of a Gaussian
     ids: nd(ti.i32, ndim=1),  # [slots] out: the Gaussian of each slot
     entry: nd(ti.i32, ndim=1),  # [slots] out: where the slot's gradient goes, so that a Gaussian's lie together
@@ -84,14 +86,15 @@ def fill_slots(
         if spread - segment * _THREAD_STEP == 0:
             for o in range(segment * visible // SEGMENTS, (segment + 1) * visible // SEGMENTS):
                 i = order[o]
+                x0, x1, y0, y1 = tile_rect[i, 0], tile_rect[i, 1], tile_rect[i, 2], tile_rect[i, 3]
+                tile, left = y0 * tiles_x + x0, x1 - x0
                 to = first_of[i]
-                for ty in range(tile_rect[i, 2], tile_rect[i, 3] + 1):
-                    for tx in range(tile_rect[i, 0], tile_rect[i, 1] + 1):
-                        slot = cursor[ty * tiles_x + tx, segment]
-                        cursor[ty * tiles_x + tx, segment] = slot + 1
-                        ids[slot] = i
-                        entry[slot] = to
-                        to += 1
+                for k in range(to, to + (x1 - x0 + 1) * (y1 - y0 + 1)):
+                    slot = cursor[segment, tile]
+                    cursor[segment, tile] = slot + 1
+                    ids[slot], entry[slot] = i, k
+                    tile += ti.select(left == 0, tiles_x - (x1 - x0), 1)
+                    left = ti.select(left == 0, x1 - x0, left - 1)
 
 
 @ti.func

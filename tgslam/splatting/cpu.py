@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from tgslam import runtime
 from tgslam.gaussian_map import GaussianMap, MapGradient
-from tgslam.kernels import projection, rasterize
+from tgslam.kernels import projection, projection_gradient, rasterize
 from tgslam.kernels.simd import CHUNK, CHUNKS, LANES, PER_ROW, TILE
 from tgslam.splatting.images import ImageGradient, RenderImages
 from tgslam.stopwatch import Stopwatch, stage
@@ -58,7 +58,7 @@ class CpuSplatting:
         self._slots = _SlotBuffers(1 << 15, self.tiles)
         self._splats = _SplatBuffers(1)
         self._start = runtime.zeros((self.tiles + 1,), np.int32)
-        self._per_tile = runtime.zeros((self.tiles, rasterize.SEGMENTS), np.int32)
+        self._per_tile = runtime.zeros((rasterize.SEGMENTS, self.tiles), np.int32)
         self.slot_count = 0
 
     @property
@@ -105,8 +105,8 @@ class CpuSplatting:
                 n, splats.tile_count, splats.first_of, embedding, slots.grad, slots.embedding_grad, splats.moments
             )
         with stage(self.stopwatch, "unproject"):
-            blocks = runtime.zeros((max(1, -(-n // projection.POSE_BLOCK)), 6))
-            projection.project_backward(
+            blocks = runtime.zeros((max(1, -(-n // projection_gradient.POSE_BLOCK)), 6))
+            projection_gradient.project_backward(
                 n, gaussians.mean, gaussians.log_scale, gaussians.quat_wxyz, gaussians.opacity_logit,
                 gaussians.embedding, pose, self._camera, self.camera.width, self.camera.height, embedding,
                 splats.tile_count, splats.moments.reshape(splats.capacity, -1),
@@ -138,9 +138,9 @@ class CpuSplatting:
         visible = np.flatnonzero(tile_count)
         order = _depth_order(runtime.to_host(splats.splat)[visible, projection.Z], visible)
         rasterize.count_slots(len(order), order, splats.tile_rect, self.tiles_x, self._per_tile)
-        ends = np.cumsum(self._per_tile, dtype=np.int32)
-        self._start[1:] = ends[rasterize.SEGMENTS - 1 :: rasterize.SEGMENTS]
-        cursor = (ends - self._per_tile.ravel()).reshape(self._per_tile.shape)
+        cursor = np.cumsum(self._per_tile, 0, dtype=np.int32)
+        np.cumsum(cursor[-1], out=self._start[1:])
+        cursor += self._start[:-1] - self._per_tile
         rasterize.fill_slots(
             len(order), order, splats.tile_rect, self.tiles_x, cursor, splats.first_of,
             self._slots.ids, self._slots.entry,
