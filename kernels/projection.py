@@ -207,18 +207,20 @@ def store_splat(
     tile_rect: ti.template(),
     tile_count: ti.template(),
 ):
-    """Write what `splat_of` made of a Gaussian, with its colours."""
-    for k in ti.static(range(_COLUMNS)):
-        splat[i, k] = columns[k]
-    splat[i, INV_Z] = columns[_COLUMNS]
-    for c in ti.static(range(3)):
-        splat[i, RED + c] = colour[i, c]
-        if ti.static(with_embedding):
-            splat[i, EMBEDDING + c] = sigmoid(embedding[i, c])
+    """Write what `splat_of` made of a Gaussian, with its colours, if it touches a tile."""
     x0, x1 = ti.cast(columns[_COLUMNS + 1], ti.i32), ti.cast(columns[_COLUMNS + 2], ti.i32)
     y0, y1 = ti.cast(columns[_COLUMNS + 3], ti.i32), ti.cast(columns[_COLUMNS + 4], ti.i32)
-    tile_rect[i, 0], tile_rect[i, 1], tile_rect[i, 2], tile_rect[i, 3] = x0, x1 - 1, y0, y1 - 1
-    tile_count[i] = (x1 - x0) * (y1 - y0)
+    tiles = (x1 - x0) * (y1 - y0)
+    tile_count[i] = tiles
+    if tiles > 0:
+        tile_rect[i, 0], tile_rect[i, 1], tile_rect[i, 2], tile_rect[i, 3] = x0, x1 - 1, y0, y1 - 1
+        for k in ti.static(range(_COLUMNS)):
+            splat[i, k] = columns[k]
+        splat[i, INV_Z] = columns[_COLUMNS]
+        for c in ti.static(range(3)):
+            splat[i, RED + c] = colour[i, c]
+            if ti.static(with_embedding):
+                splat[i, EMBEDDING + c] = sigmoid(embedding[i, c])
 
 
 @ti.func
@@ -268,8 +270,8 @@ def project(
     width: ti.i32,
     height: ti.i32,
     with_embedding: ti.template(),
-    splat: nd(ti.f32, ndim=2),  # [N, SPLAT] out
-    tile_rect: nd(ti.i32, ndim=2),  # [N, 4] out where touched: first and last tile in x, then in y
+    splat: nd(ti.f32, ndim=2),  # [N, SPLAT] out where a tile is touched
+    tile_rect: nd(ti.i32, ndim=2),  # [N, 4] out, likewise: first and last tile in x, then in y
     tile_count: nd(ti.i32, ndim=1),  # [N] out: tiles touched
 ):
     """Gaussians -> splats and the tiles that their alpha >= 1/255 box touches (Zwicker's EWA, as 3DGS)."""
