@@ -201,8 +201,6 @@ def store_splat(
     i,
     columns: ti.template(),
     colour: ti.template(),
-    embedding: ti.template(),
-    with_embedding: ti.template(),
     splat: ti.template(),
     tile_rect: ti.template(),
     tile_count: ti.template(),
@@ -219,8 +217,6 @@ def store_splat(
         splat[i, INV_Z] = columns[_COLUMNS]
         for c in ti.static(range(3)):
             splat[i, RED + c] = colour[i, c]
-            if ti.static(with_embedding):
-                splat[i, EMBEDDING + c] = sigmoid(embedding[i, c])
 
 
 @ti.func
@@ -284,20 +280,31 @@ def project(
                 columns = splat_of(
                     point, row(i, log_scale, 3), row(i, quat, 4), opacity_logit[i], pose, camera, w, h
                 )  # fmt: skip
-                store_splat(i, columns, colour, embedding, with_embedding, splat, tile_rect, tile_count)
+                store_splat(i, columns, colour, splat, tile_rect, tile_count)
+                if ti.static(with_embedding):
+                    if tile_count[i] > 0:
+                        for c in ti.static(range(3)):
+                            splat[i, EMBEDDING + c] = sigmoid(embedding[i, c])
     else:
         for block in range((count + LANES - 1) // LANES):
             first, after = block * LANES, ti.min(block * LANES + LANES, count)
             point = in_camera(pose, rows(first, count, mean, 3))
-            before = 0  # any of them is before the camera
+            ahead = 0  # 1: one of them at least
             for j in range(LANES):
-                before = ti.select(point[2][j] > NEAR_M, 1, before)
-            if before == 1:
+                ahead = ti.select(point[2][j] > NEAR_M, 1, ahead)
+            if ahead == 1:
                 scales, turns, logit = shapes(first, count, log_scale, quat, opacity_logit)
                 columns = splat_of(point, scales, turns, logit, pose, camera, w, h)
                 for i in range(first, after):
                     of_one = [columns[k][i - first] for k in ti.static(range(_COLUMNS + 5))]
-                    store_splat(i, of_one, colour, embedding, with_embedding, splat, tile_rect, tile_count)
+                    store_splat(i, of_one, colour, splat, tile_rect, tile_count)
+                if ti.static(with_embedding):
+                    theta = rows(first, count, embedding, 3)
+                    shade = [sigmoid(theta[c]) for c in ti.static(range(3))]
+                    for i in range(first, after):
+                        if tile_count[i] > 0:
+                            for c in ti.static(range(3)):
+                                splat[i, EMBEDDING + c] = shade[c][i - first]
             else:
                 for i in range(first, after):
                     tile_count[i] = 0

@@ -9,6 +9,7 @@ from tgslam.kernels.cuda.warp import WARP, warp_sum
 from tgslam.kernels.projection import (
     BLUR,
     BLUR_DEPTH,
+    EMBEDDING,
     M_0,
     M_CURVATURE_COLOUR,
     M_CURVATURE_DEPTH,
@@ -179,7 +180,7 @@ def gradients_of_16(
 def add_gradient(
     i,
     own: ti.template(),  # of `gaussian_gradient`
-    embedding: ti.template(),
+    splat: ti.template(),
     with_embedding: ti.template(),
     moments: ti.template(),
     grad_mean: ti.template(),
@@ -196,7 +197,7 @@ def add_gradient(
         grad_log_scale[i, k] = grad_log_scale[i, k] + own[3 + k]
         grad_colour[i, k] = grad_colour[i, k] + moments[i, M_RED + k]
         if ti.static(with_embedding):
-            e = sigmoid(embedding[i, k])
+            e = splat[i, EMBEDDING + k]
             grad_embedding[i, k] = grad_embedding[i, k] + moments[i, M_EMBEDDING + k] * e * (1.0 - e)
     for k in ti.static(range(4)):
         grad_quat[i, k] = grad_quat[i, k] + own[6 + k]
@@ -212,7 +213,7 @@ def project_backward(
     log_scale: nd(ti.f32, ndim=2),  # [N, 3] log m
     quat: nd(ti.f32, ndim=2),  # [N, 4] wxyz
     opacity_logit: nd(ti.f32, ndim=1),  # [N]
-    embedding: nd(ti.f32, ndim=2),  # [N, 3] theta
+    splat: nd(ti.f32, ndim=2),  # [N, SPLAT] of `project`, read for the embedding's logistic function
     pose: nd(ti.f32, ndim=1),  # [12] T_cw
     camera: nd(ti.f32, ndim=1),  # [4] fx, fy, cx, cy px
     width: ti.i32,
@@ -247,7 +248,7 @@ def project_backward(
                     for c in ti.static(range(6)):
                         part[c] = pose_part[c]
                     add_gradient(
-                        i, own, embedding, with_embedding, moments, grad_mean, grad_log_scale, grad_quat,
+                        i, own, splat, with_embedding, moments, grad_mean, grad_log_scale, grad_quat,
                         grad_opacity_logit, grad_colour, grad_embedding, curvature,
                     )  # fmt: skip
             for c in ti.static(range(6)):
@@ -268,7 +269,7 @@ def project_backward(
                             for c in ti.static(range(6)):
                                 total[c] += pose_part[c][i - first]
                             add_gradient(
-                                i, [own[c][i - first] for c in ti.static(range(OWN))], embedding, with_embedding,
+                                i, [own[c][i - first] for c in ti.static(range(OWN))], splat, with_embedding,
                                 moments, grad_mean, grad_log_scale, grad_quat, grad_opacity_logit, grad_colour,
                                 grad_embedding, curvature,
                             )  # fmt: skip

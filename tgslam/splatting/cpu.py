@@ -108,7 +108,7 @@ class CpuSplatting:
             blocks = runtime.zeros((max(1, -(-n // projection_gradient.POSE_BLOCK)), 6))
             projection_gradient.project_backward(
                 n, gaussians.mean, gaussians.log_scale, gaussians.quat_wxyz, gaussians.opacity_logit,
-                gaussians.embedding, pose, self._camera, self.camera.width, self.camera.height, embedding,
+                splats.splat, pose, self._camera, self.camera.width, self.camera.height, embedding,
                 splats.tile_count, splats.moments.reshape(splats.capacity, -1),
                 into.mean, into.log_scale, into.quat_wxyz, into.opacity_logit, into.colour, into.embedding,
                 into.curvature, blocks,

@@ -96,7 +96,7 @@ class CudaSplatting:
         with stage(self.stopwatch, "unproject"):
             projection_gradient.project_backward(
                 gaussians.count, gaussians.mean, gaussians.log_scale, gaussians.quat_wxyz, gaussians.opacity_logit,
-                gaussians.embedding, pose, self._camera, self.camera.width, self.camera.height, embedding,
+                splats.splat, pose, self._camera, self.camera.width, self.camera.height, embedding,
                 splats.tile_count, splats.moments, into.mean, into.log_scale, into.quat_wxyz, into.opacity_logit,
                 into.colour, into.embedding, into.curvature, splats.pose_rows,
             )  # fmt: skip

@@ -49,7 +49,7 @@ def forward_and_backward(count: int = 300, with_embedding: bool = True) -> dict[
     }  # fmt: skip
     gradients = {name: runtime.zeros(shape) for name, shape in shapes.items()}
     projection_gradient.project_backward(
-        count, mean, log_scale, quat, logit, embedding, pose, camera, _WIDTH, _HEIGHT, with_embedding,
+        count, mean, log_scale, quat, logit, splat, pose, camera, _WIDTH, _HEIGHT, with_embedding,
         tile_count, moments, *gradients.values(),
     )  # fmt: skip
     results = {"splat": splat, "tile_rect": tile_rect, "tile_count": tile_count}
