@@ -1,8 +1,9 @@
-"""What the vector kernels share: 16 lanes are the 4x4 pixels of a chunk, 16 chunks make a 16x16 tile.
+"""What the vector kernels share: 16 lanes are the 4x4 pixels of a chunk, of which 16 make a tile, or 16 Gaussians.
 
 In a `lanes_kernel`, arithmetic on `Lanes` stays whole down to LLVM, which maps it to whatever vector registers the CPU
 has; a plain `ti.kernel` takes vectors apart first, and LLVM's vectorizer does not find all of them again. What works
-whole is `+ - * /`, `+=`, `*=`, `ti.min`, `ti.max`, `ti.sqrt`, `ti.floor` and `ti.select` on a comparison of two Lanes.
+whole is `+ - * /`, `+=`, `*=`, `ti.min`, `ti.max`, `ti.sqrt`, `ti.floor`, comparisons and `ti.select`, a scalar float
+in place of any of their operands but one. Lanes are filled and read one by one by a loop (`v[j]`), also at run time.
 Casts (a Lanes times an integer is one), bit patterns, `abs`, `exp`, unary minus and `-=` abort in Taichi 1.7.4.
 """
 
