@@ -249,6 +249,8 @@ class ClosureConfig:
     least_turn_rad: float = setting(0.0005, 0.0, 1.0)
     robust: str = setting("cauchy", choices=("none", "huber", "cauchy", "dcs"))  # noise of closures and planes
     robust_sigmas: float = setting(3.0, 0.1, 1000.0)  # beyond which an error counts less
+    # A landmark's views count as this much less certain: where the surface strays from its plane, they all err alike
+    landmark_inflation: float = setting(2.0, 1.0, 100.0)
     relinearise: float = setting(0.01, 0.0, 1.0)  # rad and m; with solver: incremental
     # Structure closures: which keyframes are compared, and what of it becomes an edge
     interval: int = setting(4, 1, 1000)  # k of Table 4: at every k-th keyframe
