@@ -12,14 +12,14 @@ from tgslam.plane_fit import CellGrid, Floats, Labels
 from tgslam.planes.merging import Agreement, Indices
 from tgslam.planes.moments import joining_cost, planes_of, squared_residuals
 
-_SIGMAS = 4.0  # beyond which a measurement lies before or behind a plane
+_SIGMAS = 3.0  # beyond which a measurement lies before or behind a plane
 _RUN = 2  # samples one after the other off the plane: one alone is a border's ragged pixel
 _OPEN_SHARE = 0.2  # of the ways between two pieces, that may be open: their borders need not be parallel
 _CLOSED_SHARE = 0.5  # of the ways that have to be known to be closed; without measurements nothing is known
 _SEEN_SHARE = 0.5  # of a way that is measured when it is known
 _PARTED_SHARE = 0.5  # of the ways, on which something close before the plane may part it
 _CLOSE_M = 0.15  # before a plane: a board between two fronts; what is farther off only hides part of the view
-_REACH = 1.0  # a gap may be so many times as wide as the larger piece is (root of its area)
+_REACH = 2.5  # a gap may be so many times as wide as the larger piece is (root of its area)
 _LINKS = 48
 _SAMPLES = 16  # along each link, or more where it is longer, in steps of at most a pixel
 _MOST_SAMPLES = 64
