@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from tgslam import plane_fit
 from tgslam.plane_fit import CellGrid, Floats
@@ -33,6 +34,7 @@ def planar_cells(depth_m: np.ndarray, grid: CellGrid, sigma: float, share: float
     not look like that.
     """
     moments, white = plane_fit.cell_moments(depth_m, grid)
+    white = np.minimum(white, median_filter(white.reshape(grid.shape), 3).ravel())
     variance = np.clip(white, sigma**2, (_NOISIEST * sigma) ** 2)
     count = moments[:, 0]
     fits = squared_residuals(moments) <= sigmas**2 * variance * np.maximum(count - 3, 1.0)
