@@ -31,7 +31,7 @@ def planar_cells(depth_m: np.ndarray, grid: CellGrid, sigma: float, share: float
     """Cells of which at least that share is measured, and whose residual is at most so many times the noise.
 
     The noise is sigma, 1/m, or where neighbouring pixels differ by more at random, as much more as they do: shape does
-    not look like that.
+    not look like that. An oblique step through a cell does, but not through most of the cells around it.
     """
     moments, white = plane_fit.cell_moments(depth_m, grid)
     white = np.minimum(white, median_filter(white.reshape(grid.shape), 3).ravel())

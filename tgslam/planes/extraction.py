@@ -78,7 +78,7 @@ def _continuous(graph: CellGraph, agreement: Agreement) -> Indices:
 def _evidence(
     planes: Floats, change: Floats, sums: SegmentSums, grid: CellGrid, sigma: float, fewest_px: float
 ) -> Iterator[tuple[int, Evidence]]:
-    """Index and evidence of planes that have enough pixels, in more than a line; change: [P, 3] since the sums."""
+    """Index and evidence of the planes with enough pixels, in more than a line; change: [P, 3] since the sums."""
     for index in range(len(planes)):
         rows = sums.of(index)
         if rows.pixels.sum() >= fewest_px and width_px(rows.moments.sum(axis=0)) >= 1.0:
