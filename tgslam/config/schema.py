@@ -271,6 +271,37 @@ class ClosureConfig:
 
 
 @dataclass(frozen=True)
+class LoopConfig:
+    """Visual loop closures: keyframes that look the same, whatever the graph says of where they are."""
+
+    enabled: bool = setting(False)  # not part of the method; off, what structure closures do is seen alone
+    features: int = setting(500, 50, 10_000)  # of a keyframe, at most
+    corner_contrast: int = setting(10, 1, 254)  # of FAST corners, steps of 1/255
+    max_bits: int = setting(64, 0, 256)  # of 256 in which descriptors of one point differ
+    ratio: float = setting(0.85, 0.1, 1.0)  # of that to the same for the next best point: more is ambiguous
+    min_gap: int = setting(10, 1, 100_000)  # keyframes between the two
+    candidates: int = setting(4, 2, 100)  # earlier keyframes that are compared with one, the most alike
+    # What makes two keyframes views of one place
+    min_inliers: int = setting(25, 6, 10_000)  # points that agree on one motion, each at a place of its own
+    min_inlier_share: float = setting(0.5, 0.0, 1.0)  # of the points that match by their looks
+    min_depth_agreement: float = setting(0.8, 0.0, 1.0)  # of depth that both views ought to see
+    min_overlap: float = setting(0.2, 0.0, 1.0)  # of the images, where it agrees
+    partner_gap: int = setting(6, 1, 1000)  # keyframes at most between an earlier one and a second that confirms it
+    partner_rad: float = setting(0.03, 1e-4, 3.15)  # by which the two may disagree
+    partner_m: float = setting(0.06, 1e-4, 10.0)
+    understated: float = setting(10.0, 1.0, 1000.0)  # drift may be so many times what the graph believes
+    gate_probability: float = setting(0.99, 0.5, 1.0)  # of a right motion to pass a chi-square test of that
+    # The motion
+    inlier_px: float = setting(3.0, 0.1, 100.0)  # at the finest level of the images, to begin with
+    pixel_sigma: float = setting(0.8, 0.01, 100.0)  # of a feature, likewise
+    model_sigma_m: float = setting(0.005, 1e-5, 1.0)  # of a feature's depth, beyond the sensor's noise
+    common_sigma_rad: float = setting(0.002, 1e-6, 1.0)  # what all features have in error together
+    common_sigma_m: float = setting(0.005, 1e-6, 1.0)
+    known_rad: float = setting(0.02, 1e-4, 10.0)  # a motion known no better than this in any direction is no closure
+    known_m: float = setting(0.05, 1e-4, 10.0)
+
+
+@dataclass(frozen=True)
 class EvaluationConfig:
     """The fixed protocol: held-out frames never reach mapping, and keyframes are never held out."""
 
@@ -294,4 +325,5 @@ class Config:
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
     structure: StructureConfig = dataclasses.field(default_factory=StructureConfig)
     closures: ClosureConfig = dataclasses.field(default_factory=ClosureConfig)
+    loops: LoopConfig = dataclasses.field(default_factory=LoopConfig)
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
