@@ -220,6 +220,17 @@ def test_the_gate_moves_weight_from_colour_to_depth():
     )
 
 
+def test_without_the_gate_no_term_asks_for_texture():
+    rendering, observed = scene(40, 48, masked=False)
+    ungated, gt = evaluate(rendering, observed, replace(CONFIG, gate=False))
+    assert not gt["gate"].any()
+    plain, _ = evaluate(rendering, observed, replace(CONFIG, gate=False, gate_depth_boost=0.0))
+    np.testing.assert_array_equal(runtime.to_host(ungated.g_depth), runtime.to_host(plain.g_depth))
+    gated, _ = evaluate(rendering, observed)
+    assert ungated.parts["ssim"] > gated.parts["ssim"], "texture and all else count alike"
+    assert ungated.parts["grad"] > gated.parts["grad"]
+
+
 def test_curvatures_are_those_of_reweighted_least_squares():
     (_, depth, opacity), (colour_gt, depth_gt, mask) = scene(30, 41)
     offset = np.float32(np.random.default_rng(2).normal(size=depth.shape) * 0.1)

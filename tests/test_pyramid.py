@@ -59,6 +59,14 @@ def test_levels_of_a_frame_match_the_twin(size, first):
             np.testing.assert_allclose(gate, twin, atol=1e-4)
 
 
+def test_without_the_gate_every_strength_counts_as_texture():
+    pyramid = LivePyramid(camera_of(SIZES[0]), 0, LEVELS, LossConfig(gate=False))
+    for level in pyramid.update(Frame(0, 0.0, *view(SIZES[0]))):
+        strength = np.float32([0.0, 1e-7, 0.5, 8.0])
+        gate = 1 - np.clip((strength - level.gate_low) * level.gate_inverse_range, 0, 1)
+        np.testing.assert_array_equal(gate, 0)
+
+
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("first", [0, 1, 2])
 def test_levels_of_a_rendering_match_the_twin(size, first):

@@ -17,6 +17,7 @@ from tgslam.types import Camera
 
 STEEPEST_RAD = 1.3  # between a surface's normal and the optical axis
 DEPTH_EDGE = 0.05  # measurements farther apart than this part of their depth lie on different surfaces
+UNGATED = (-1.0, 1.0)  # in place of what `gate_range` returns: T = 0 for a gradient of any length
 _SAMPLE_ROWS = 120  # percentiles come from a grid of about this many rows
 
 

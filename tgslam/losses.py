@@ -24,7 +24,7 @@ class Observation:
     """
 
     size: tuple[int, int]  # height and width in pixels
-    gate: np.ndarray  # [H, W] T of Eq. 11
+    gate: np.ndarray  # [H, W] T of Eq. 11; 0 without the gate
     prepared: PreparedObservation
 
 
@@ -149,7 +149,10 @@ def observe(
         mask = runtime.empty((height, width))
         mask.fill(1.0)
     require("mask", mask, (height, width))
-    gate = images.texture_gate(images.luminance(colour), config.gate_percentile, config.gate_noise_floor)
+    if config.gate:
+        gate = images.texture_gate(images.luminance(colour), config.gate_percentile, config.gate_noise_floor)
+    else:
+        gate = runtime.zeros((height, width))
     prepare = cuda.observe if runtime.device() is runtime.Device.CUDA else cpu.observe
     return Observation((height, width), gate, prepare(colour, depth_m, mask, gate))
 

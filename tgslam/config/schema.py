@@ -54,6 +54,7 @@ class SyntheticConfig:
 class LossConfig:
     """The adaptive RGB-depth objective, Eqs. 10-13."""
 
+    gate: bool = setting(True)  # False: T = 0 everywhere, and no term of the objective asks how much texture there is
     gate_percentile: float = setting(95.0, 50.0, 100.0)  # G_max of Eq. 11 is this percentile of the gradient magnitude
     gate_noise_floor: float = setting(
         0.01, 1e-6, 1.0

@@ -60,11 +60,15 @@ class LivePyramid:
         images.reduce_frame(runtime.to_device(frame.colour), runtime.to_device(frame.depth_m), base.grey, base.depth)
         for level, pair, sample in zip(self.levels, self._images.halvings(), self._samples, strict=True):
             kernels.pack_live(pair.grey, pair.depth, level.pixels)
-            kernels.sample_strength(level.pixels, images.sample_step((level.camera.height, level.camera.width)), sample)
-            level.gate_low, level.gate_inverse_range = images.gate_range(
-                runtime.to_host(sample), self.loss.gate_percentile, self.loss.gate_noise_floor
-            )
+            level.gate_low, level.gate_inverse_range = self._gate_range(level, sample)
         return self.levels
+
+    def _gate_range(self, level: LiveLevel, sample: np.ndarray) -> tuple[float, float]:
+        """G_min and 1 / (G_max - G_min + epsilon) of Eq. 11, from a grid of pixels. sample: memory for it."""
+        if not self.loss.gate:
+            return images.UNGATED
+        kernels.sample_strength(level.pixels, images.sample_step((level.camera.height, level.camera.width)), sample)
+        return images.gate_range(runtime.to_host(sample), self.loss.gate_percentile, self.loss.gate_noise_floor)
 
 
 class ModelPyramid:
