@@ -48,7 +48,7 @@ class Slam:
     def __init__(self, camera: Camera, config: Config) -> None:
         self.camera, self.sigma_per_m2 = camera, config.loss.depth_sigma_per_m2
         self.tracker = make_tracker(camera, config.tracking, config.loss)
-        self.motion = ConstantVelocity()
+        self.motion = ConstantVelocity(config.tracking)
         self.selector = KeyframeSelector(config.keyframes)
         rng = np.random.default_rng(config.seed)
         self.mapper = Mapper(
@@ -117,13 +117,15 @@ class Slam:
         return planes_of(self.mapper.planes.registry)
 
     def _track(self, frame: Frame) -> TrackingResult:
-        predicted = self.motion.predict(frame.timestamp_s)
+        predicted, prior = self.motion.predict(frame.timestamp_s), self.motion.information(frame.timestamp_s)
         latest = self._posed[-1]
         fallbacks = [
             latest.T_ck @ latest.keyframe.T_cw,
             *(k.T_cw for k in self.mapper.keyframes[: -_FALLBACKS - 1 : -1]),
         ]
-        return track_or_recover(self.tracker, frame, self.mapper.gaussians, predicted, fallbacks, self.exposure)
+        return track_or_recover(
+            self.tracker, frame, self.mapper.gaussians, predicted, fallbacks, self.exposure, prior
+        )  # fmt: skip
 
     def _keyframe_cue(self, frame: Frame, result: TrackingResult) -> str:
         seen = self.tracker.rasterizer.visible(self.mapper.gaussians.count)

@@ -86,6 +86,12 @@ class TrackingConfig:
     weight_depth: float = setting(1.0, 0.0, 100.0)
     weight_colour: float = setting(0.3, 0.0, 100.0)
     weight_gradient: float = setting(0.3, 0.0, 100.0)
+    correlated_px: float = setting(100.0, 1.0, 1e6)  # neighbouring pixels err alike: so many inform like one
+    # What hands do within a frame, where pixels do not say: the last velocity, but for these standard deviations
+    acceleration_m: float = setting(5.0, 0.01, 1e4)  # m/s^2
+    acceleration_rad: float = setting(20.0, 0.01, 1e4)  # rad/s^2
+    speed_m: float = setting(1.0, 0.001, 1e3)  # m/s, while no velocity is known
+    speed_rad: float = setting(2.0, 0.001, 1e3)  # rad/s
     max_distance_sigmas: float = setting(15.0, 1.0, 1000.0)  # depth residuals beyond are no match
     exposure: str = setting("gain", choices=("none", "gain", "gain_bias"))  # a frame's brightness against the map
     min_opacity: float = setting(0.8, 0.0, 1.0)  # model pixels less covered are not used
@@ -243,8 +249,8 @@ class ClosureConfig:
     formulation: str = setting("landmarks", choices=("closures", "landmarks", "both"))  # edges, planes as variables
     solver: str = setting("incremental", choices=("incremental", "batch"))  # iSAM2, Levenberg-Marquardt
     # A step's error beyond what tracking's residuals show
-    odometry_sigma_rad: float = setting(0.001, 1e-7, 1.0)
-    odometry_sigma_m: float = setting(0.003, 1e-7, 1.0)
+    odometry_sigma_rad: float = setting(0.0002, 1e-7, 1.0)
+    odometry_sigma_m: float = setting(0.0006, 1e-7, 1.0)
     # The map follows when a keyframe has moved or turned by so much
     least_shift_m: float = setting(0.001, 0.0, 1.0)
     least_turn_rad: float = setting(0.0005, 0.0, 1.0)

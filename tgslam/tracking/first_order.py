@@ -34,9 +34,14 @@ class FirstOrderTracker:
         self.rasterizer = self._judge.rasterizer
 
     def track(
-        self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure
+        self,
+        frame: Frame,
+        gaussians: GaussianMap,
+        T_cw: NDArray[np.float64],
+        exposure: Exposure,
+        prior: NDArray[np.float64] | None = None,
     ) -> TrackingResult:
-        """Pose of `frame` from the prediction T_cw [4, 4] and the last frame's exposure."""
+        """See `Tracker.track`. The prior plays no part: steps are small enough to stay near the prediction."""
         if self._gradient.mean.shape[0] != gaussians.capacity:
             self._gradient = MapGradient.zeros(gaussians.capacity)
         if self.config.exposure == "none":

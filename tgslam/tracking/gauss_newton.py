@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from tgslam.config.schema import LossConfig, TrackingConfig
 from tgslam.gaussian_map import GaussianMap
-from tgslam.geometry import adjoint, inverse, se3_exp
+from tgslam.geometry import adjoint, inverse, se3_exp, se3_log
 from tgslam.render import Rasterizer
 from tgslam.stopwatch import Stopwatch, stage
 from tgslam.tracking.exposure import Exposure, fit_exposure
@@ -35,15 +35,21 @@ class GaussNewtonTracker:
         self._linearise = [Lineariser(level.camera, config, loss) for level in self._live_pyramid.levels]
 
     def track(
-        self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure
+        self,
+        frame: Frame,
+        gaussians: GaussianMap,
+        T_cw: NDArray[np.float64],
+        exposure: Exposure,
+        prior: NDArray[np.float64] | None = None,
     ) -> TrackingResult:
-        """Pose of `frame` from the prediction T_cw [4, 4] and the last frame's exposure."""
+        """See `Tracker.track`."""
+        predicted, prior = T_cw, np.zeros((6, 6)) if prior is None else self.config.correlated_px * prior
         with stage(self.stopwatch, "pyramid"):
             live = self._live_pyramid.update(frame)
         for _ in range(self.config.renders):
             model = self._model(gaussians, T_cw)
             with stage(self.stopwatch, "align"):
-                T_ml, exposure, last = self._align(live, model, exposure)
+                T_ml, exposure, last = self._align(live, model, exposure, predicted @ inverse(T_cw), prior)
             T_cw = inverse(T_ml) @ T_cw
         return self._result(T_cw, T_ml, exposure, last)
 
@@ -58,7 +64,7 @@ class GaussNewtonTracker:
     def _result(
         self, T_cw: NDArray[np.float64], T_ml: NDArray[np.float64], exposure: Exposure, last: NormalEquations
     ) -> TrackingResult:
-        information = adjoint(T_ml).T @ last.A @ adjoint(T_ml)
+        information = adjoint(T_ml).T @ last.A @ adjoint(T_ml) / self.config.correlated_px
         measures = {
             "inlier_ratio": last.inliers / max(last.matched, 1.0),
             "overlap": last.candidates / max(last.live_pixels, 1.0),
@@ -84,9 +90,18 @@ class GaussNewtonTracker:
             return self._model_pyramid.update(rendered)
 
     def _align(
-        self, live: list[LiveLevel], model: list[ModelLevel], exposure: Exposure
+        self,
+        live: list[LiveLevel],
+        model: list[ModelLevel],
+        exposure: Exposure,
+        T_pm: NDArray[np.float64],
+        prior: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], Exposure, NormalEquations]:
-        """Coarse to fine from the identity; returns T_ml, the exposure, and the last equations."""
+        """Coarse to fine from the identity; returns T_ml, the exposure, and the last equations.
+
+        T_pm: from where the model was rendered to the predicted camera, which `prior` [6, 6] draws the pose to, at the
+        finest level. Coarser ones have fewer pixels to hold against it, so it counts as much less there.
+        """
         T_ml = np.eye(4)
         for level in reversed(range(len(live))):
             for _ in range(self.config.iterations[level]):
@@ -94,7 +109,9 @@ class GaussNewtonTracker:
                 exposure = fit_exposure(equations.intensity, self.config.exposure, exposure)
                 # a weak damping holds the directions that nothing observes
                 damping = _DAMPING * np.trace(equations.A) + 1e-9
-                step = np.linalg.solve(equations.A + damping * np.eye(6), -equations.b)
+                drawn = prior / 4**level
+                gradient = equations.b + drawn @ se3_log(T_pm @ T_ml)
+                step = np.linalg.solve(equations.A + drawn + damping * np.eye(6), -gradient)
                 T_ml = se3_exp(step) @ T_ml
                 if np.abs(step).max() < _CONVERGED:
                     break

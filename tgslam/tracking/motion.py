@@ -1,19 +1,22 @@
-"""Constant-velocity prediction of the next pose."""
+"""Constant-velocity prediction of the next pose, and how far it can be trusted."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam.config.schema import TrackingConfig
 from tgslam.geometry import inverse, se3_exp, se3_log
 
 
 class ConstantVelocity:
     """Predicts T_cw by repeating the last motion, scaled by the time between frames."""
 
-    def __init__(self) -> None:
+    def __init__(self, config: TrackingConfig) -> None:
+        self._config = config
         self._last: tuple[float, NDArray[np.float64]] | None = None
         self._velocity = np.zeros(6)  # rad/s, m/s
+        self._known = False  # whether that was seen
 
     def predict(self, timestamp_s: float) -> NDArray[np.float64]:
         """T_cw [4, 4] at that time."""
@@ -22,10 +25,27 @@ class ConstantVelocity:
         last_s, T_cw = self._last
         return se3_exp(self._velocity * (timestamp_s - last_s)) @ T_cw
 
+    def information(self, timestamp_s: float) -> NDArray[np.float64]:
+        """[6, 6] of the prediction's left perturbation: none before the first pose.
+
+        Cameras in hands and on robots do not jump: as much as they accelerate between frames is what is uncertain, and
+        all of the velocity while there is none.
+        """
+        if self._last is None:
+            return np.zeros((6, 6))
+        elapsed_s = timestamp_s - self._last[0]
+        turn_rad = self._config.acceleration_rad * elapsed_s**2
+        shift_m = self._config.acceleration_m * elapsed_s**2
+        if not self._known:
+            turn_rad += self._config.speed_rad * elapsed_s
+            shift_m += self._config.speed_m * elapsed_s
+        return np.diag(np.array([turn_rad] * 3 + [shift_m] * 3) ** -2.0)
+
     def update(self, timestamp_s: float, T_cw: NDArray[np.float64]) -> None:
         """Take in a tracked pose."""
         if self._last is not None and timestamp_s > self._last[0]:
             self._velocity = se3_log(T_cw @ inverse(self._last[1])) / (timestamp_s - self._last[0])
+            self._known = True
         self._last = (timestamp_s, T_cw)
 
     def move(self, motion: NDArray[np.float64]) -> None:
@@ -36,3 +56,4 @@ class ConstantVelocity:
     def slow_down(self) -> None:
         """Believe in half the velocity: where tracking is lost, the last one soon tells nothing."""
         self._velocity = self._velocity / 2.0
+        self._known = False

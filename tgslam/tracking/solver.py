@@ -27,9 +27,17 @@ class Tracker(Protocol):
     stopwatch: Stopwatch | None  # set it to have the stages timed, for benchmarks
 
     def track(
-        self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure
+        self,
+        frame: Frame,
+        gaussians: GaussianMap,
+        T_cw: NDArray[np.float64],
+        exposure: Exposure,
+        prior: NDArray[np.float64] | None = None,
     ) -> TrackingResult:
-        """Pose of `frame` from the prediction T_cw [4, 4] (world to camera) and the last frame's exposure."""
+        """Pose of `frame` from the prediction T_cw [4, 4] (world to camera) and the last frame's exposure.
+
+        prior: [6, 6] information on a left perturbation of T_cw, how far it is to be trusted; None = a place to start.
+        """
         ...
 
 
@@ -47,9 +55,13 @@ def track_or_recover(
     predicted: NDArray[np.float64],
     fallbacks: Iterable[NDArray[np.float64]],
     exposure: Exposure,
+    prior: NDArray[np.float64] | None = None,
 ) -> TrackingResult:
-    """Track from the prediction, then from each fallback until one holds; if none does, coast on the prediction."""
-    first = tracker.track(frame, gaussians, predicted, exposure)
+    """Track from the prediction, then from each fallback until one holds; if none does, coast on the prediction.
+
+    prior: of the prediction, see `Tracker.track`; the fallbacks are places to start.
+    """
+    first = tracker.track(frame, gaussians, predicted, exposure, prior)
     if not first.lost:
         return first
     for T_cw in fallbacks:
