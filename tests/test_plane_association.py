@@ -136,6 +136,13 @@ def test_near_cells_have_no_more_than_the_gap_between_them() -> None:
     assert support.near(beside, 0.0).tolist() == [True, False, False, False, False]
 
 
+def test_a_row_of_single_cells_has_an_outline():
+    support = Support(plane_at((0, 0, 1), (0, 0, 0), 0.01), 0.05)
+    support.add(np.column_stack([np.arange(12), np.zeros(12, int)]), keyframe=0)
+    (polygon,) = support.polygons()
+    assert len(polygon) >= 3
+
+
 def test_a_huge_support_gets_coarser_cells_and_keeps_its_area() -> None:
     support = Support(plane_at((0, 0, 1), (0, 0, 0), 0.01), 0.05)
     for start in range(0, 3000, 100):

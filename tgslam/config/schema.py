@@ -162,7 +162,7 @@ class PlanesConfig:
     join_shift_m: float = setting(0.01, 0.0, 1.0)  # likewise, of depth, on a surface without steps
     across_area_m2: float = setting(0.5, 0.0, 1000.0)  # of the larger of two pieces that something stands before
     pixel_sigmas: float = setting(3.0, 0.5, 100.0)  # of a pixel from its plane
-    min_area_share: float = setting(0.004, 0.0, 1.0)  # of the image
+    min_area_share: float = setting(0.003, 0.0, 1.0)  # of the image
     max_rms_sigmas: float = setting(2.5, 0.1, 100.0)  # residual beyond which a segment is not plane
     max_bend_sigmas: float = setting(0.35, 1e-3, 100.0)  # likewise, of the part that is a paraboloid, and that
     max_bend_m: float = setting(0.005, 1e-5, 1.0)  # in depth; only beyond both a surface is not plane
