@@ -15,7 +15,6 @@ _MAX_EVIDENCE = 20  # so that what has moved away can be forgotten in reasonable
 _MAX_SIDE = 1024  # cells; a larger grid gets cells twice the size
 _OUTLINE_SCALE = 2  # outlines are traced at this many pixels a cell
 _MIN_OUTLINE_CELLS = 4
-_MIN_CORNERS = 3  # a strip of one cell may be simplified to a line
 
 
 class Support:
