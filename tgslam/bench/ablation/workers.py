@@ -22,6 +22,8 @@ from tgslam.runtime import available_threads
 
 Ended = Callable[[Job, str | None], None]  # told of each run as it ends: None, or why it failed
 
+_COMMAND = (sys.executable, "-m", "tgslam")
+_INTERRUPTED = 130  # exit code of a run that somebody stopped
 _POLL_S = 0.05
 _PREFIX = "tgslam: error: "
 _log = logging.getLogger(__name__)
@@ -115,6 +117,8 @@ class _Process:
         code = self._process.returncode
         if not code:
             return None
+        if code == _INTERRUPTED:
+            return "interrupted"
         lines = self._errors.read_text(encoding="utf-8", errors="replace").split("\n")
         said = [line.removeprefix(_PREFIX) for line in lines if line.startswith(_PREFIX)]
         return said[-1] if said else f"killed by signal {-code}" if code < 0 else f"exit code {code}"
@@ -133,9 +137,6 @@ class _Process:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-_COMMAND = (sys.executable, "-m", "tgslam")
 
 
 def _failure_of(future: Any) -> str | None:
