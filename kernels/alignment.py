@@ -28,6 +28,7 @@ W, W_L, W_M, W_LL, W_LM = (COLOUR_SUM + 1 + k for k in range(5))  # moments of l
 LIVE_PIXELS = W_LM + 1  # with depth
 SUMS = LIVE_PIXELS + 1
 PACKED_SUMS = -(-SUMS // LANES)  # vectors that hold a row of sums
+PADDED_SUMS = PACKED_SUMS * LANES
 
 # Entries of the settings array; the last 12 are T_ml's rows [R | t]
 (
@@ -66,6 +67,7 @@ _INLIER_SIGMAS = 3.0
 _MIN_COSINE = 0.2  # grazing rays: the noise across the surface is taken to be no less than this share of that along z
 _NEAR_M = 0.05
 MIN_DEPTH_M = 1e-3  # keeps what does not count finite
+_LANE = tuple(float(j) for j in range(LANES))
 _PART_STEP = 128  # a loop over parts counts in steps of this, since Taichi hands a thread 512 iterations at a time
 
 SMALLEST = 4  # px, a side of an image in which any point can be looked up
@@ -306,7 +308,7 @@ def add_16_pixels(
     """Add what a block of a row's live pixels says. Only the look-ups in the model go lane by lane."""
     height, width = surface.shape[0], surface.shape[1]
     depth = live[v, block, LIVE_DEPTH]
-    u = Lanes([float(j) for j in range(LANES)]) + ti.cast(block * LANES, ti.f32)
+    u = Lanes(_LANE) + ti.cast(block * LANES, ti.f32)
     ray_x, ray_y, x, y, z = reprojected(settings, u, filled(u, ti.cast(v, ti.f32)), depth)
     um, vm, seen = in_model_image(settings, x, y, z, width, height)
     seen *= indicator(filled(z, 0.0), depth)
@@ -330,22 +332,13 @@ def add_16_pixels(
 
 
 @ti.func
-def entry(sums: ti.template(), row, column: ti.template()):
-    """A vector of a row of sums, 0 beyond the last."""
-    result = Lanes(0.0)
-    if ti.static(column < SUMS):
-        result = sums[row, column]
-    return result
-
-
-@ti.func
-def lane_sums(sums: ti.template(), row, k: ti.template()):
+def lane_sums(sums: ti.template(), row, k):
     """Lane j: the sum of the lanes of entry k + j of a row."""
     return sums_of_16(
-        entry(sums, row, k), entry(sums, row, k + 1), entry(sums, row, k + 2), entry(sums, row, k + 3),
-        entry(sums, row, k + 4), entry(sums, row, k + 5), entry(sums, row, k + 6), entry(sums, row, k + 7),
-        entry(sums, row, k + 8), entry(sums, row, k + 9), entry(sums, row, k + 10), entry(sums, row, k + 11),
-        entry(sums, row, k + 12), entry(sums, row, k + 13), entry(sums, row, k + 14), entry(sums, row, k + 15),
+        sums[row, k], sums[row, k + 1], sums[row, k + 2], sums[row, k + 3],
+        sums[row, k + 4], sums[row, k + 5], sums[row, k + 6], sums[row, k + 7],
+        sums[row, k + 8], sums[row, k + 9], sums[row, k + 10], sums[row, k + 11],
+        sums[row, k + 12], sums[row, k + 13], sums[row, k + 14], sums[row, k + 15],
     )  # fmt: skip
 
 
@@ -355,7 +348,7 @@ def normal_equations(
     live: nd(Lanes, ndim=3),  # [H, B, LIVE], B = ceil(W / 16)
     surface: nd(Surface, ndim=2),  # [H, W]
     texture: nd(Texture, ndim=2),  # [H, W]
-    sums: nd(Lanes, ndim=2),  # [parts(H), SUMS] scratch
+    sums: nd(Lanes, ndim=2),  # [parts(H), PADDED_SUMS] scratch
     packed: nd(Lanes, ndim=2),  # [parts(H), PACKED_SUMS] out: the sums of a part side by side, then zeros
 ):
     """Sum the weighted normal equations of Eqs. 12, 13 over the live pixels, a row of sums for each part of the image.
@@ -365,12 +358,12 @@ def normal_equations(
     for spread in range(packed.shape[0] * _PART_STEP):
         part = spread // _PART_STEP
         if spread - part * _PART_STEP == 0:
-            for k in ti.static(range(SUMS)):
+            for k in range(PADDED_SUMS):
                 sums[part, k] = Lanes(0.0)
             if surface.shape[0] >= SMALLEST and surface.shape[1] >= SMALLEST:
                 for v in range(part * ROWS, ti.min(part * ROWS + ROWS, surface.shape[0])):
                     for block in range(live.shape[1]):
                         if lane_max(live[v, block, LIVE_DEPTH]) > 0.0:
                             add_16_pixels(settings, v, block, live, surface, texture, sums, part)
-            for k in ti.static(range(PACKED_SUMS)):
+            for k in range(PACKED_SUMS):
                 packed[part, k] = lane_sums(sums, part, k * LANES)

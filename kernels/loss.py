@@ -96,7 +96,8 @@ def is_inside_row(i, height):
 @ti.func
 def shifted(left, centre, right, offset: ti.template()):
     """The 16 pixels `offset` to the right of `centre`, from it and its neighbours; |offset| <= 16."""
-    return Lanes([(left, centre, right)[source][k] for source, k in ti.static(SHIFTED[offset])])
+    blocks = ti.static((left, centre, right))
+    return Lanes([blocks[source][k] for source, k in SHIFTED[offset]])
 
 
 @ti.func

@@ -1,17 +1,25 @@
-"""Projection of 3D Gaussians to screen-space splats, and its gradient.
+"""Projection of 3D Gaussians to screen-space splats.
 
 A splat is what the rasterizer needs of a Gaussian: centre, inverse covariance, opacity, tangent-plane depth, colour.
 Columns of a splat row, and of the moments that the rasterizer's backward pass sums for it, are the constants below.
+
+The functions take scalars and Lanes alike: a CUDA thread works on one Gaussian, the CPU on 16 at once. Vectors are
+lists of components (matrices: lists of rows), which Taichi takes apart when it translates.
 """
 
 import taichi as ti
 
-from tgslam.kernels.cuda.warp import WARP, warp_sum
-from tgslam.kernels.simd import REACH, TILE
+from tgslam.kernels.simd import (
+    LANES,
+    REACH,
+    TILE,
+    Lanes,
+    exponential,
+    lanes_kernel,
+)
 
 nd = ti.types.ndarray
 mat3 = ti.types.matrix(3, 3, ti.f32)
-mat23 = ti.types.matrix(2, 3, ti.f32)
 
 U, V, QA, QB, QC, FADE, Z, ZU, ZV, RED, EMBEDDING, INV_Z = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 12, 15
 SPLAT = 16  # columns of a splat row: centre px, half the inverse covariance, -ln(opacity), depth and its slope, colours
@@ -25,92 +33,226 @@ BLUR_DEPTH = 0.03  # px^2 in the regression of depth on the pixel: BLUR would fl
 BLUR = 0.3  # px^2 added to the screen covariance, the 3DGS standard's low-pass filter
 NEAR_M = 0.05
 EDGE = 1.3  # the Jacobian is evaluated at most this many half-images off the axis
-POSE_BLOCK = WARP  # Gaussians whose pose gradients one writer sums
+_COLUMNS = 9  # of a splat row, U to ZV, that `splat_of` returns in their order, and INV_Z after them
+# log((1 + t) / (1 - t)) / t by t^2, |t| <= 1/3, to 8e-9 relative: Lawson's iteratively reweighted least squares
+_LOG = (2.0, 0.66666317, 0.400249094, 0.279606044, 0.281783342)
 
 
 @ti.func
 def sigmoid(x):
     """Logistic function, stable for both signs."""
-    e = ti.exp(-ti.abs(x))
-    return ti.select(x >= 0, 1.0 / (1.0 + e), e / (1.0 + e))
+    e = exponential(ti.min(x, 0.0 - x))
+    return ti.select(x < 0.0, e, 1.0) / (1.0 + e)
+
+
+@ti.func
+def softplus(x):
+    """log(1 + exp(x)), stable for both signs."""
+    e = exponential(ti.min(x, 0.0 - x))
+    t = e / (2.0 + e)
+    tt = t * t
+    return ti.max(x, 0.0) + t * (_LOG[0] + tt * (_LOG[1] + tt * (_LOG[2] + tt * (_LOG[3] + tt * _LOG[4]))))
+
+
+@ti.func
+def rotation_rows(w, x, y, z):
+    """Unit quaternion -> rotation matrix, as a list of rows."""
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
 
 
 @ti.func
 def rotation_from_quat(w, x, y, z):
     """Unit quaternion -> rotation matrix."""
-    return mat3(
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    )
+    return mat3(rotation_rows(w, x, y, z))
 
 
 @ti.func
-def rotation_of_pose(pose: ti.template()):
-    """The rotation of T_cw, stored row by row as [R | t]."""
-    return mat3([pose[0], pose[1], pose[2]], [pose[4], pose[5], pose[6]], [pose[8], pose[9], pose[10]])
+def dot(a: ti.template(), b: ti.template()):
+    """a . b"""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @ti.func
-def clamped(ratio, centre, focal, size):
+def cross(a: ti.template(), b: ti.template()):
+    """a x b"""
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+@ti.func
+def combined(a, u: ti.template(), b, v: ti.template(), c, w: ti.template()):
+    """a u + b v + c w"""
+    return [a * u[k] + b * v[k] + c * w[k] for k in ti.static(range(3))]
+
+
+@ti.func
+def in_camera(pose: ti.template(), mean):
+    """The centre in the camera's frame; T_cw is stored row by row as [R | t]."""
+    x, y, z = mean
+    return [
+        pose[0] * x + pose[1] * y + pose[2] * z + pose[3],
+        pose[4] * x + pose[5] * y + pose[6] * z + pose[7],
+        pose[8] * x + pose[9] * y + pose[10] * z + pose[11],
+    ]
+
+
+@ti.func
+def axes_in_camera(pose: ti.template(), q: ti.template()):
+    """R Rq, whose columns are the Gaussian's axes in the camera's frame, as a list of rows."""
+    x, y, z = rotation_rows(q[0], q[1], q[2], q[3])
+    return [
+        combined(pose[0], x, pose[1], y, pose[2], z),
+        combined(pose[4], x, pose[5], y, pose[6], z),
+        combined(pose[8], x, pose[9], y, pose[10], z),
+    ]
+
+
+@ti.func
+def inverse_norm(q: ti.template()):
+    """1 / |q|"""
+    return 1.0 / ti.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+
+
+@ti.func
+def in_view(ratio, centre, focal, size):
     """x/z (or y/z) limited to EDGE half-images, so that the linearisation stays sane beside the camera."""
     low = (-0.5 * (EDGE - 1.0) * size - centre) / focal
-    high = ((1.0 + 0.5 * (EDGE - 1.0)) * size - centre) / focal
+    high = ((0.5 + 0.5 * EDGE) * size - centre) / focal
     return ti.min(ti.max(ratio, low), high)
 
 
 @ti.func
-def blurred_determinant(ax: ti.template(), ay: ti.template(), blur):
-    """det of the screen covariance A A^T + blur I, by Lagrange's identity for det(A A^T).
+def scaled(s: ti.template(), v: ti.template()):
+    """The components of v, each times its own of s."""
+    return [s[k] * v[k] for k in ti.static(range(3))]
+
+
+@ti.func
+def mixed(a, v: ti.template(), b, w: ti.template()):
+    """a v + b w"""
+    return [a * v[k] + b * w[k] for k in ti.static(range(3))]
+
+
+@ti.func
+def inverse_determinant(area, xx, yy, blur):
+    """1 / det of the screen covariance A A^T + blur I, by Lagrange's identity for det(A A^T) = |ax x ay|^2.
 
     cxx cyy - cxy^2 cancels to nothing in float32 for a long thin splat across the pixel grid; this sums positive terms.
     """
-    return ax.cross(ay).norm_sqr() + blur * (ax.norm_sqr() + ay.norm_sqr() + blur)
+    return 1.0 / (area + blur * (xx + yy + blur))
 
 
 @ti.func
-def precision_times_rows(ax: ti.template(), ay: ti.template(), blur):
-    """B = (A A^T + blur I)^-1 A, with the triple product since, for the reason above, B is small where A is large."""
-    n = ax.cross(ay)
-    inv_det = 1.0 / blurred_determinant(ax, ay, blur)
-    return (ay.cross(n) + blur * ax) * inv_det, (n.cross(ax) + blur * ay) * inv_det
+def touched(centre, radius, last_px):
+    """First row (or column) of tiles that [centre - radius, centre + radius] px touches, and the one after the last."""
+    low, high = ti.max(centre - radius, 0.0), ti.min(centre + radius, last_px)
+    end = ti.floor(high * (1.0 / TILE)) + 1.0
+    return ti.select(low <= high, ti.floor(low * (1.0 / TILE)), 0.0), ti.select(low <= high, end, 0.0)
 
 
 @ti.func
-def axes_in_camera(R: ti.template(), Rq: ti.template(), s: ti.template()):
-    """M = R Rq diag(s): the Gaussian's axes in the camera frame, as long as its standard deviations."""
-    M = R @ Rq
-    for k in ti.static(range(3)):
-        for r in ti.static(range(3)):
-            M[r, k] *= s[k]
-    return M
+def splat_of(
+    point: ti.template(),  # in the camera's frame
+    log_scale,
+    quat,
+    opacity_logit,
+    pose: ti.template(),
+    camera: ti.template(),
+    width,
+    height,
+):
+    """A splat's columns, then the tiles it touches, in whole floats: x from, to before, y from, to before."""
+    fx, fy = camera[0], camera[1]
+    inv_norm = inverse_norm(quat)
+    q = [quat[k] * inv_norm for k in ti.static(range(4))]
+    axes = axes_in_camera(pose, q)
+    s = [exponential(log_scale[k]) for k in ti.static(range(3))]
+    z = ti.max(point[2], NEAR_M)  # what lies nearer is not drawn, but stays finite
+    inv_z = 1.0 / z
+    x, y = point[0] * inv_z, point[1] * inv_z
+    j0, j1 = fx * inv_z, fy * inv_z
+    ax = scaled(s, mixed(j0, axes[0], 0.0 - j0 * in_view(x, camera[2], fx, width), axes[2]))
+    ay = scaled(s, mixed(j1, axes[1], 0.0 - j1 * in_view(y, camera[3], fy, height), axes[2]))
+    mz = scaled(s, axes[2])
+    normal = cross(ax, ay)
+    area, xx, xy, yy = dot(normal, normal), dot(ax, ax), dot(ax, ay), dot(ay, ay)
+    inv_det = inverse_determinant(area, xx, yy, BLUR)
+    inv_depth_det = inverse_determinant(area, xx, yy, BLUR_DEPTH)
+    cxx, cyy = xx + BLUR, yy + BLUR
+    zu = (dot(mz, cross(ay, normal)) + BLUR_DEPTH * dot(mz, ax)) * inv_depth_det
+    zv = (dot(mz, cross(normal, ax)) + BLUR_DEPTH * dot(mz, ay)) * inv_depth_det
+    u, v = fx * x + camera[2], fy * y + camera[3]
+    fade = softplus(0.0 - opacity_logit)
+    reach = 2.0 * (REACH - fade)  # Mahalanobis^2 where alpha has fallen to ALPHA_MIN
+    drawn = ti.min(reach, point[2] - NEAR_M) > 0.0
+    reach = ti.max(reach, 0.0)
+    x0, x1 = touched(u, ti.sqrt(reach * cxx), ti.select(drawn, width - 1.0, -1.0))
+    y0, y1 = touched(v, ti.sqrt(reach * cyy), ti.select(drawn, height - 1.0, -1.0))
+    return [
+        u, v, 0.5 * cyy * inv_det, (0.0 - xy) * inv_det, 0.5 * cxx * inv_det, fade, z, zu, zv, inv_z, x0, x1, y0, y1
+    ]  # fmt: skip
 
 
 @ti.func
-def quat_gradient(H: ti.template(), q: ti.template()):
-    """Gradient by the unit quaternion q, given that by its rotation matrix."""
-    w, a, b, c = q[0], q[1], q[2], q[3]
-    skew = ti.Vector([H[2, 1] - H[1, 2], H[0, 2] - H[2, 0], H[1, 0] - H[0, 1]])
-    ab, ac, bc = H[0, 1] + H[1, 0], H[0, 2] + H[2, 0], H[1, 2] + H[2, 1]
-    return 2.0 * ti.Vector(
-        [
-            a * skew[0] + b * skew[1] + c * skew[2],
-            w * skew[0] + b * ab + c * ac - 2.0 * a * (H[1, 1] + H[2, 2]),
-            w * skew[1] + a * ab + c * bc - 2.0 * b * (H[0, 0] + H[2, 2]),
-            w * skew[2] + a * ac + b * bc - 2.0 * c * (H[0, 0] + H[1, 1]),
-        ]
-    )
+def store_splat(
+    i,
+    columns: ti.template(),
+    colour: ti.template(),
+    splat: ti.template(),
+    tile_rect: ti.template(),
+    tile_count: ti.template(),
+):
+    """Write what `splat_of` made of a Gaussian, with its colours, if it touches a tile."""
+    x0, x1 = ti.cast(columns[_COLUMNS + 1], ti.i32), ti.cast(columns[_COLUMNS + 2], ti.i32)
+    y0, y1 = ti.cast(columns[_COLUMNS + 3], ti.i32), ti.cast(columns[_COLUMNS + 4], ti.i32)
+    tiles = (x1 - x0) * (y1 - y0)
+    tile_count[i] = tiles
+    if tiles > 0:
+        tile_rect[i, 0], tile_rect[i, 1], tile_rect[i, 2], tile_rect[i, 3] = x0, x1 - 1, y0, y1 - 1
+        for k in ti.static(range(_COLUMNS)):
+            splat[i, k] = columns[k]
+        splat[i, INV_Z] = columns[_COLUMNS]
+        for c in ti.static(range(3)):
+            splat[i, RED + c] = colour[i, c]
 
 
 @ti.func
-def jacobian_gradient(g, focal, ratio, limited, inv_z2):
-    """Gradients by x (or y) and by z of the Jacobian entry -limited focal / z, times g (constant where limited)."""
-    by_z = g * focal * limited * inv_z2
-    free = ratio == limited
-    return ti.select(free, -g * focal * inv_z2, 0.0), ti.select(free, 2.0 * by_z, by_z)
+def row(i, array: ti.template(), columns: ti.template()):
+    """A row of an array, as a list."""
+    return [array[i, k] for k in ti.static(range(columns))]
 
 
-@ti.kernel
+@ti.func
+def rows(first, count, array: ti.template(), columns: ti.template()):
+    """LANES rows of an array from `first` on as a list of Lanes, a column each; the last of `count` rows goes on."""
+    result = [Lanes(0.0) for k in ti.static(range(columns))]
+    for j in range(LANES):
+        i = ti.min(first + j, count - 1)
+        for k in ti.static(range(columns)):
+            result[k][j] = array[i, k]
+    return result
+
+
+@ti.func
+def shapes(first, count, log_scale: ti.template(), quat: ti.template(), opacity_logit: ti.template()):
+    """The same of what makes a Gaussian's shape: three, four and one column."""
+    scales = [Lanes(0.0) for k in ti.static(range(3))]
+    turns = [Lanes(0.0) for k in ti.static(range(4))]
+    logit = Lanes(0.0)
+    for j in range(LANES):
+        i = ti.min(first + j, count - 1)
+        for k in ti.static(range(3)):
+            scales[k][j] = log_scale[i, k]
+        for k in ti.static(range(4)):
+            turns[k][j] = quat[i, k]
+        logit[j] = opacity_logit[i]
+    return scales, turns, logit
+
+
+@lanes_kernel
 def project(
     count: ti.i32,
     mean: nd(ti.f32, ndim=2),  # [N, 3] m, world
@@ -124,211 +266,45 @@ def project(
     width: ti.i32,
     height: ti.i32,
     with_embedding: ti.template(),
-    splat: nd(ti.f32, ndim=2),  # [N, SPLAT] out
-    tile_rect: nd(ti.i32, ndim=2),  # [N, 4] out: first and last tile in x, then in y; empty: first > last
+    splat: nd(ti.f32, ndim=2),  # [N, SPLAT] out where a tile is touched
+    tile_rect: nd(ti.i32, ndim=2),  # [N, 4] out, likewise: first and last tile in x, then in y
     tile_count: nd(ti.i32, ndim=1),  # [N] out: tiles touched
 ):
     """Gaussians -> splats and the tiles that their alpha >= 1/255 box touches (Zwicker's EWA, as 3DGS)."""
-    for i in range(count):
-        R = rotation_of_pose(pose)
-        x = R @ ti.Vector([mean[i, 0], mean[i, 1], mean[i, 2]]) + ti.Vector([pose[3], pose[7], pose[11]])
-        tile_rect[i, 0], tile_rect[i, 1], tile_rect[i, 2], tile_rect[i, 3] = 0, -1, 0, -1
-        tile_count[i] = 0
-        if x[2] > NEAR_M:
-            fx, fy = camera[0], camera[1]
-            q = ti.Vector([quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3]]).normalized()
-            s = ti.Vector([ti.exp(log_scale[i, k]) for k in range(3)])
-            M = axes_in_camera(R, rotation_from_quat(q[0], q[1], q[2], q[3]), s)
-            inv_z = 1.0 / x[2]
-            jx = -clamped(x[0] * inv_z, camera[2], fx, width) * fx * inv_z
-            jy = -clamped(x[1] * inv_z, camera[3], fy, height) * fy * inv_z
-            ax = ti.Vector([fx * inv_z * M[0, k] + jx * M[2, k] for k in range(3)])
-            ay = ti.Vector([fy * inv_z * M[1, k] + jy * M[2, k] for k in range(3)])
-            mz = ti.Vector([M[2, 0], M[2, 1], M[2, 2]])
-            cxx, cxy, cyy = ax.dot(ax) + BLUR, ax.dot(ay), ay.dot(ay) + BLUR
-            inv_det = 1.0 / blurred_determinant(ax, ay, BLUR)
-            qxx, qxy, qyy = cyy * inv_det, -cxy * inv_det, cxx * inv_det
-            bx, by = precision_times_rows(ax, ay, BLUR_DEPTH)
-            u, v = fx * x[0] * inv_z + camera[2], fy * x[1] * inv_z + camera[3]
-            fade = ti.log(1.0 + ti.exp(-ti.abs(opacity_logit[i]))) + ti.max(-opacity_logit[i], 0.0)
-            splat[i, U], splat[i, V] = u, v
-            splat[i, QA], splat[i, QB], splat[i, QC] = 0.5 * qxx, qxy, 0.5 * qyy
-            splat[i, FADE], splat[i, Z], splat[i, INV_Z] = fade, x[2], inv_z
-            splat[i, ZU], splat[i, ZV] = mz.dot(bx), mz.dot(by)
-            for c in ti.static(range(3)):
-                splat[i, RED + c] = colour[i, c]
-                if ti.static(with_embedding):
-                    splat[i, EMBEDDING + c] = sigmoid(embedding[i, c])
-            reach = ti.max(2.0 * (REACH - fade), 0.0)  # Mahalanobis^2 where alpha has fallen to ALPHA_MIN
-            rx, ry = ti.sqrt(reach * cxx), ti.sqrt(reach * cyy)
-            if reach > 0.0 and u + rx >= 0 and u - rx <= width - 1 and v + ry >= 0 and v - ry <= height - 1:
-                x0 = ti.cast(ti.max(u - rx, 0.0), ti.i32) // TILE
-                x1 = ti.cast(ti.min(u + rx, width - 1.0), ti.i32) // TILE
-                y0 = ti.cast(ti.max(v - ry, 0.0), ti.i32) // TILE
-                y1 = ti.cast(ti.min(v + ry, height - 1.0), ti.i32) // TILE
-                tile_rect[i, 0], tile_rect[i, 1] = x0, x1
-                tile_rect[i, 2], tile_rect[i, 3] = y0, y1
-                tile_count[i] = (x1 - x0 + 1) * (y1 - y0 + 1)
-
-
-@ti.func
-def gaussian_backward(
-    i,
-    mean: ti.template(),
-    log_scale: ti.template(),
-    quat: ti.template(),
-    opacity_logit: ti.template(),
-    embedding: ti.template(),
-    pose: ti.template(),
-    camera: ti.template(),
-    width,
-    height,
-    with_embedding: ti.template(),
-    moments: ti.template(),
-    grad_mean: ti.template(),
-    grad_log_scale: ti.template(),
-    grad_quat: ti.template(),
-    grad_opacity_logit: ti.template(),
-    grad_colour: ti.template(),
-    grad_embedding: ti.template(),
-    curvature: ti.template(),
-):
-    """One Gaussian's part of `project_backward`; returns its part of the pose gradient.
-
-    Sums into arrays are written out, since `+=` on an array element is an atomic addition, on the CPU a locked loop.
-    """
-    # The forward quantities again
-    R = rotation_of_pose(pose)
-    x = R @ ti.Vector([mean[i, 0], mean[i, 1], mean[i, 2]]) + ti.Vector([pose[3], pose[7], pose[11]])
-    fx, fy = camera[0], camera[1]
-    raw = ti.Vector([quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3]])
-    inv_norm = 1.0 / raw.norm()
-    q = raw * inv_norm
-    Rq = rotation_from_quat(q[0], q[1], q[2], q[3])
-    s = ti.Vector([ti.exp(log_scale[i, k]) for k in range(3)])
-    M = axes_in_camera(R, Rq, s)
-    inv_z = 1.0 / x[2]
-    rx, ry = x[0] * inv_z, x[1] * inv_z
-    tx, ty = clamped(rx, camera[2], fx, width), clamped(ry, camera[3], fy, height)
-    j0, j1, jx, jy = fx * inv_z, fy * inv_z, -tx * fx * inv_z, -ty * fy * inv_z
-    mz = ti.Vector([M[2, 0], M[2, 1], M[2, 2]])
-    ax = ti.Vector([j0 * M[0, k] + jx * M[2, k] for k in range(3)])
-    ay = ti.Vector([j1 * M[1, k] + jy * M[2, k] for k in range(3)])
-    cxx, cxy, cyy = ax.dot(ax) + BLUR, ax.dot(ay), ay.dot(ay) + BLUR
-    inv_det = 1.0 / blurred_determinant(ax, ay, BLUR)
-    qxx, qxy, qyy = cyy * inv_det, -cxy * inv_det, cxx * inv_det
-    # Inverse covariance Q and depth slopes D mz -> rows of A = J M and the z row of M. With B = Q A and
-    # D = P A (Q with BLUR, P with BLUR_DEPTH) and the part of mz that the slopes leave, no term of a long
-    # splat is the small difference of large ones:
-    # dQ = -Q dA B^T - B dA^T Q, d(slope) = P dA rest - D dA^T slope + D dmz
-    bx, by = precision_times_rows(ax, ay, BLUR)
-    dx, dy = precision_times_rows(ax, ay, BLUR_DEPTH)
-    inv_depth_det = 1.0 / blurred_determinant(ax, ay, BLUR_DEPTH)
-    pxx, pxy, pyy = ay.dot(ay) + BLUR_DEPTH, -cxy, ax.dot(ax) + BLUR_DEPTH
-    zu, zv = mz.dot(dx), mz.dot(dy)
-    rest = mz - zu * ax - zv * ay
-    gz, gzu, gzv = moments[i, M_DEPTH], moments[i, M_DEPTH_X], moments[i, M_DEPTH_Y]
-    gu = qxx * moments[i, M_X] + qxy * moments[i, M_Y] - zu * moments[i, M_SLOPE]
-    gv = qxy * moments[i, M_X] + qyy * moments[i, M_Y] - zv * moments[i, M_SLOPE]
-    gxx, gxy, gyy = -0.5 * moments[i, M_XX], -0.5 * moments[i, M_XY], -0.5 * moments[i, M_YY]
-    gbx, gby = gxx * bx + gxy * by, gxy * bx + gyy * by
-    gmz = gzu * dx + gzv * dy
-    gax = (pxx * gzu + pxy * gzv) * inv_depth_det * rest - zu * gmz - 2.0 * (qxx * gbx + qxy * gby)
-    gay = (pxy * gzu + pyy * gzv) * inv_depth_det * rest - zv * gmz - 2.0 * (qxy * gbx + qyy * gby)
-    # Rows of A = J M -> J and M
-    m0 = ti.Vector([M[0, 0], M[0, 1], M[0, 2]])
-    m1 = ti.Vector([M[1, 0], M[1, 1], M[1, 2]])
-    gj0, gj1, gjx, gjy = gax.dot(m0), gay.dot(m1), gax.dot(mz), gay.dot(mz)
-    gm0, gm1, gm2 = j0 * gax, j1 * gay, jx * gax + jy * gay + gmz
-    # Camera-frame centre
-    inv_z2 = inv_z * inv_z
-    gx, gy = gu * j0, gv * j1
-    gzc = gz - (gu * fx * rx + gv * fy * ry) * inv_z - (gj0 * fx + gj1 * fy) * inv_z2
-    jx_by_x, jx_by_z = jacobian_gradient(gjx, fx, rx, tx, inv_z2)
-    jy_by_y, jy_by_z = jacobian_gradient(gjy, fy, ry, ty, inv_z2)
-    gp = ti.Vector([gx + jx_by_x, gy + jy_by_y, gzc + jx_by_z + jy_by_z])
-    gw = R.transpose() @ gp
-    for c in ti.static(range(3)):
-        grad_mean[i, c] = grad_mean[i, c] + gw[c]
-    # Left perturbation: dx = w cross x + t, dM = [w] M
-    turn = x.cross(gp)
-    for k in ti.static(range(3)):
-        turn += ti.Vector([M[0, k], M[1, k], M[2, k]]).cross(ti.Vector([gm0[k], gm1[k], gm2[k]]))
-    # M = R Rq S
-    H = R.transpose() @ ti.Matrix.rows([gm0, gm1, gm2])
-    for k in ti.static(range(3)):
-        for r in ti.static(range(3)):
-            H[r, k] *= s[k]
-        # A's column k times its own gradient, and mz's, with what cancels left out
-        gs = gmz[k] * rest[k] - gbx[k] * bx[k] - gby[k] * by[k]
-        grad_log_scale[i, k] = grad_log_scale[i, k] + 2.0 * gs
-    gq = quat_gradient(H, q)
-    gq = (gq - q * gq.dot(q)) * inv_norm
-    for k in ti.static(range(4)):
-        grad_quat[i, k] = grad_quat[i, k] + gq[k]
-    grad_opacity_logit[i] = grad_opacity_logit[i] + moments[i, M_0] * sigmoid(-opacity_logit[i])
-    for k in ti.static(range(3)):
-        grad_colour[i, k] = grad_colour[i, k] + moments[i, M_RED + k]
-        if ti.static(with_embedding):
-            e = sigmoid(embedding[i, k])
-            grad_embedding[i, k] = grad_embedding[i, k] + moments[i, M_EMBEDDING + k] * e * (1.0 - e)
-    curvature[i, 0] = curvature[i, 0] + moments[i, M_CURVATURE_COLOUR]
-    curvature[i, 1] = curvature[i, 1] + moments[i, M_CURVATURE_DEPTH]
-    return ti.Vector([turn[0], turn[1], turn[2], gp[0], gp[1], gp[2]])
-
-
-@ti.kernel
-def project_backward(
-    count: ti.i32,
-    mean: nd(ti.f32, ndim=2),  # [N, 3] m, world
-    log_scale: nd(ti.f32, ndim=2),  # [N, 3] log m
-    quat: nd(ti.f32, ndim=2),  # [N, 4] wxyz
-    opacity_logit: nd(ti.f32, ndim=1),  # [N]
-    embedding: nd(ti.f32, ndim=2),  # [N, 3] theta
-    pose: nd(ti.f32, ndim=1),  # [12] T_cw
-    camera: nd(ti.f32, ndim=1),  # [4] fx, fy, cx, cy px
-    width: ti.i32,
-    height: ti.i32,
-    with_embedding: ti.template(),
-    tile_count: nd(ti.i32, ndim=1),  # [N] 0 = not rendered
-    moments: nd(ti.f32, ndim=2),  # [N, MOMENTS or more]
-    grad_mean: nd(ti.f32, ndim=2),  # [N, 3] added to, as are all outputs but the pose's
-    grad_log_scale: nd(ti.f32, ndim=2),  # [N, 3]
-    grad_quat: nd(ti.f32, ndim=2),  # [N, 4]
-    grad_opacity_logit: nd(ti.f32, ndim=1),  # [N]
-    grad_colour: nd(ti.f32, ndim=2),  # [N, 3]
-    grad_embedding: nd(ti.f32, ndim=2),  # [N, 3]
-    curvature: nd(ti.f32, ndim=2),  # [N, 2] summed residual weights: colour, depth
-    grad_pose: nd(ti.f32, ndim=2),  # [blocks, 6] (rotation, translation), left perturbation of T_cw, a row a block
-):
-    """Moments of the splats -> gradients of the Gaussians' parameters and of the pose.
-
-    A row of the pose's gradient is summed by one thread on the CPU, by one warp under CUDA, in a fixed order.
-    """
+    w, h = ti.cast(width, ti.f32), ti.cast(height, ti.f32)
     if ti.static(ti.cfg.arch == ti.cuda):
-        ti.loop_config(block_dim=128)  # a Gaussian takes many registers
-        for i in range(grad_pose.shape[0] * POSE_BLOCK):
-            part = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-            if i < count:
-                if tile_count[i] > 0:
-                    part = gaussian_backward(
-                        i, mean, log_scale, quat, opacity_logit, embedding, pose, camera, width, height,
-                        with_embedding, moments, grad_mean, grad_log_scale, grad_quat, grad_opacity_logit, grad_colour,
-                        grad_embedding, curvature,
-                    )  # fmt: skip
-            for c in ti.static(range(6)):
-                total = warp_sum(part[c])
-                if i % POSE_BLOCK == c:
-                    grad_pose[i // POSE_BLOCK, c] = total
+        for i in range(count):
+            point = in_camera(pose, row(i, mean, 3))
+            tile_count[i] = 0
+            if point[2] > NEAR_M:
+                columns = splat_of(
+                    point, row(i, log_scale, 3), row(i, quat, 4), opacity_logit[i], pose, camera, w, h
+                )  # fmt: skip
+                store_splat(i, columns, colour, splat, tile_rect, tile_count)
+                if ti.static(with_embedding):
+                    if tile_count[i] > 0:
+                        for c in ti.static(range(3)):
+                            splat[i, EMBEDDING + c] = sigmoid(embedding[i, c])
     else:
-        for block in range(grad_pose.shape[0]):
-            pose_sum = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-            for i in range(block * POSE_BLOCK, ti.min((block + 1) * POSE_BLOCK, count)):
-                if tile_count[i] > 0:
-                    pose_sum += gaussian_backward(
-                        i, mean, log_scale, quat, opacity_logit, embedding, pose, camera, width, height,
-                        with_embedding, moments, grad_mean, grad_log_scale, grad_quat, grad_opacity_logit, grad_colour,
-                        grad_embedding, curvature,
-                    )  # fmt: skip
-            for c in ti.static(range(6)):
-                grad_pose[block, c] = pose_sum[c]
+        for block in range((count + LANES - 1) // LANES):
+            first, after = block * LANES, ti.min(block * LANES + LANES, count)
+            point = in_camera(pose, rows(first, count, mean, 3))
+            ahead = 0  # 1: one of them at least
+            for j in range(LANES):
+                ahead = ti.select(point[2][j] > NEAR_M, 1, ahead)
+            if ahead == 1:
+                scales, turns, logit = shapes(first, count, log_scale, quat, opacity_logit)
+                columns = splat_of(point, scales, turns, logit, pose, camera, w, h)
+                for i in range(first, after):
+                    of_one = [columns[k][i - first] for k in ti.static(range(_COLUMNS + 5))]
+                    store_splat(i, of_one, colour, splat, tile_rect, tile_count)
+                if ti.static(with_embedding):
+                    theta = rows(first, count, embedding, 3)
+                    shade = [sigmoid(theta[c]) for c in ti.static(range(3))]
+                    for i in range(first, after):
+                        if tile_count[i] > 0:
+                            for c in ti.static(range(3)):
+                                splat[i, EMBEDDING + c] = shade[c][i - first]
+            else:
+                for i in range(first, after):
+                    tile_count[i] = 0

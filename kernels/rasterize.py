@@ -50,31 +50,45 @@ def count_slots(
     visible: ti.i32,
     order: nd(ti.i32, ndim=1),  # [visible] Gaussian indices by depth, ties by index
     tile_rect: nd(ti.i32, ndim=2),  # [N, 4]
+    first_of: nd(ti.i32, ndim=1),  # [N] first entry of a Gaussian
     tiles_x: ti.i32,
-    per_tile: nd(ti.i32, ndim=2),  # [tiles, SEGMENTS] out
+    by_depth: nd(ti.i32, ndim=2),  # [visible or more, 4] out: first tile, columns of tiles, tiles, first entry
+    per_tile: nd(ti.i32, ndim=2),  # [SEGMENTS, tiles + tiles_x + 1] out, the last tiles_x + 1 without meaning
 ):
-    """How many splats of each segment of the order touch each tile."""
+    """How many splats of each segment of the order touch each tile; a row each, for threads share no cache line then.
+
+    A rectangle of tiles is four entries of a table whose running sums, down and then along the tiles, count them: no
+    branch depends on what memory out of order has yet to bring.
+    """
     for spread in range(SEGMENTS * _THREAD_STEP):
         segment = spread // _THREAD_STEP
         if spread - segment * _THREAD_STEP == 0:
-            for tile in range(per_tile.shape[0]):
-                per_tile[tile, segment] = 0
+            for tile in range(per_tile.shape[1]):
+                per_tile[segment, tile] = 0
             for o in range(segment * visible // SEGMENTS, (segment + 1) * visible // SEGMENTS):
                 i = order[o]
-                for ty in range(tile_rect[i, 2], tile_rect[i, 3] + 1):
-                    for tx in range(tile_rect[i, 0], tile_rect[i, 1] + 1):
-                        tile = ty * tiles_x + tx
-                        per_tile[tile, segment] = per_tile[tile, segment] + 1  # `+=` would be atomic, and slow
+                columns, rows = tile_rect[i, 1] - tile_rect[i, 0] + 1, tile_rect[i, 3] - tile_rect[i, 2] + 1
+                tile = tile_rect[i, 2] * tiles_x + tile_rect[i, 0]
+                by_depth[o, 0], by_depth[o, 1], by_depth[o, 2] = tile, columns, columns * rows
+                by_depth[o, 3] = first_of[i]
+                below = tile + rows * tiles_x
+                per_tile[segment, tile] = per_tile[segment, tile] + 1  # `+=` would be atomic, and slow
+                per_tile[segment, tile + columns] = per_tile[segment, tile + columns] - 1
+                per_tile[segment, below] = per_tile[segment, below] - 1
+                per_tile[segment, below + columns] = per_tile[segment, below + columns] + 1
+            for tile in range(tiles_x, per_tile.shape[1]):
+                per_tile[segment, tile] = per_tile[segment, tile] + per_tile[segment, tile - tiles_x]
+            for tile in range(1, per_tile.shape[1]):
+                per_tile[segment, tile] = per_tile[segment, tile] + per_tile[segment, tile - 1]
 
 
 @ti.kernel
 def fill_slots(
     visible: ti.i32,
     order: nd(ti.i32, ndim=1),  # [visible] Gaussian indices by depth, ties by index
-    tile_rect: nd(ti.i32, ndim=2),  # [N, 4]
+    by_depth: nd(ti.i32, ndim=2),  # [visible, 4] of `count_slots`
     tiles_x: ti.i32,
-    cursor: nd(ti.i32, ndim=2),  # [tiles, SEGMENTS] first slot of each tile and segment; advanced
-    first_of: nd(ti.i32, ndim=1),  # [N] first entry of a Gaussian
+    cursor: nd(ti.i32, ndim=2),  # [SEGMENTS, tiles] first slot of each tile and segment; advanced
     ids: nd(ti.i32, ndim=1),  # [slots] out: the Gaussian of each slot
     entry: nd(ti.i32, ndim=1),  # [slots] out: where the slot's gradient goes, so that a Gaussian's lie together
 ):
@@ -84,14 +98,15 @@ def fill_slots(
         if spread - segment * _THREAD_STEP == 0:
             for o in range(segment * visible // SEGMENTS, (segment + 1) * visible // SEGMENTS):
                 i = order[o]
-                to = first_of[i]
-                for ty in range(tile_rect[i, 2], tile_rect[i, 3] + 1):
-                    for tx in range(tile_rect[i, 0], tile_rect[i, 1] + 1):
-                        slot = cursor[ty * tiles_x + tx, segment]
-                        cursor[ty * tiles_x + tx, segment] = slot + 1
-                        ids[slot] = i
-                        entry[slot] = to
-                        to += 1
+                tile, columns, to = by_depth[o, 0], by_depth[o, 1], by_depth[o, 3]
+                left = columns
+                for k in range(to, to + by_depth[o, 2]):
+                    slot = cursor[segment, tile]
+                    cursor[segment, tile] = slot + 1
+                    ids[slot], entry[slot] = i, k
+                    left -= 1
+                    tile += ti.select(left == 0, tiles_x - columns + 1, 1)
+                    left = ti.select(left == 0, columns, left)
 
 
 @ti.func
@@ -211,22 +226,17 @@ def forward(
 @ti.func
 def chunk_of(image: ti.template(), x0, y0):
     """The pixels of a chunk of an [H, W] image; the image's last column and row go on beyond it."""
-    bottom, right = image.shape[0] - 1, image.shape[1] - 1
-    return Lanes(
-        [image[ti.min(y0 + j // CHUNK, bottom), ti.min(x0 + j % CHUNK, right)] for j in ti.static(range(LANES))]
-    )
+    rows = [ti.min(y0 + i, image.shape[0] - 1) for i in range(CHUNK)]
+    columns = [ti.min(x0 + i, image.shape[1] - 1) for i in range(CHUNK)]
+    return Lanes([image[y, x] for y in rows for x in columns])
 
 
 @ti.func
 def chunk_of_channel(image: ti.template(), x0, y0, channel: ti.template()):
     """The same of one channel of an [H, W, 3] image."""
-    bottom, right = image.shape[0] - 1, image.shape[1] - 1
-    return Lanes(
-        [
-            image[ti.min(y0 + j // CHUNK, bottom), ti.min(x0 + j % CHUNK, right), channel]
-            for j in ti.static(range(LANES))
-        ]
-    )
+    rows = [ti.min(y0 + i, image.shape[0] - 1) for i in range(CHUNK)]
+    columns = [ti.min(x0 + i, image.shape[1] - 1) for i in range(CHUNK)]
+    return Lanes([image[y, x, channel] for y in rows for x in columns])
 
 
 @ti.func

@@ -1,8 +1,9 @@
-"""What the vector kernels share: 16 lanes are the 4x4 pixels of a chunk, 16 chunks make a 16x16 tile.
+"""What the vector kernels share: 16 lanes are the 4x4 pixels of a chunk, of which 16 make a tile, or 16 Gaussians.
 
 In a `lanes_kernel`, arithmetic on `Lanes` stays whole down to LLVM, which maps it to whatever vector registers the CPU
 has; a plain `ti.kernel` takes vectors apart first, and LLVM's vectorizer does not find all of them again. What works
-whole is `+ - * /`, `+=`, `*=`, `ti.min`, `ti.max`, `ti.sqrt`, `ti.floor` and `ti.select` on a comparison of two Lanes.
+whole is `+ - * /`, `+=`, `*=`, `ti.min`, `ti.max`, `ti.sqrt`, `ti.floor`, comparisons and `ti.select`, a scalar float
+in place of any of their operands but one. Lanes are filled and read one by one by a loop (`v[j]`), also at run time.
 Casts (a Lanes times an integer is one), bit patterns, `abs`, `exp`, unary minus and `-=` abort in Taichi 1.7.4.
 """
 
@@ -27,10 +28,16 @@ _EXP_RANGE = 5.6  # a little beyond REACH: what is cut there is below the thresh
 # exp(-x), 0 <= x <= 0.7, to 8e-8 relative: Lawson's iteratively reweighted least squares
 _EXP = (0.999999921, -0.99999254, 0.499882589, -0.165973979, 0.0397725646, -0.00584676082)
 _EXP_8TH = tuple(c / 8.0**k for k, c in enumerate(_EXP))
+# 2^x - 1, |x| <= 0.5, by its powers, to 1.6e-8 relative, likewise
+_E1, _E2, _E3, _E4, _E5, _E6 = 0.693147182, 0.240226462, 0.0555032864, 0.00961848907, 0.00133999309, 0.000153458124
+_LOG2_E = 1.0 / math.log(2.0)
 
 Lanes = ti.types.vector(LANES, ti.f32)
 LANE_X = tuple(float(j % CHUNK) for j in range(LANES))  # px, of a lane's pixel in its chunk
 LANE_Y = tuple(float(j // CHUNK) for j in range(LANES))
+# By distance, as tables: Taichi would walk the expressions for every lane of every use again, in every process
+_SWAPPED = {distance: tuple(j ^ distance for j in range(LANES)) for distance in (1, 2, 4, 8)}
+_UPPER = {distance: tuple(float(j & distance) for j in range(LANES)) for distance in _SWAPPED}
 
 
 def lanes_kernel(function: Callable[..., None]) -> Callable[..., None]:
@@ -84,6 +91,31 @@ def at_least(x, bound: ti.template()):
 
 
 @ti.func
+def exponential(x):
+    """exp(x) for scalars and Lanes alike; of Lanes |x| <= 44 (beyond, that of the limit), to the rounding of x.
+
+    For Lanes 2^f 2^n with whole n, the second factor from n's binary digits, since they have no bit patterns.
+    """
+    if ti.static(not _is_vector(x)):
+        return ti.exp(x)
+    else:
+        y = ti.max(ti.min(x * _LOG2_E, 63.0), -64.0)
+        n = ti.floor(y + 0.5)
+        f = y - n
+        ff = f * f
+        high = _E4 + f * _E5 + ff * _E6
+        power = 2.0**-64 * (1.0 + f * _E1 + ff * (_E2 + f * _E3 + ff * high))
+        n += 64.0
+        digit, factor = 64.0, 2.0**64
+        for _ in range(7):
+            power *= ti.select(n < digit, 1.0, factor)
+            n = ti.select(n < digit, n, n - digit)
+            digit *= 0.5
+            factor = ti.sqrt(factor)
+        return power
+
+
+@ti.func
 def exp_neg(q):
     """exp(-q) for 0 <= q <= REACH, less than ALPHA_MIN beyond; relative error 2.1e-6. For scalars and Lanes alike.
 
@@ -101,7 +133,7 @@ def exp_neg(q):
 @ti.func
 def swapped(v, distance: ti.template()):
     """Lane j gets lane j ^ distance."""
-    return Lanes([v[j ^ distance] for j in ti.static(range(LANES))])
+    return Lanes([v[j] for j in _SWAPPED[distance]])
 
 
 @ti.func
@@ -123,7 +155,7 @@ def lane_max(v):
 @ti.func
 def merged(a, b, distance: ti.template()):
     """Lane j gets a[j] + a[j ^ distance] where j & distance is 0, the same of b elsewhere."""
-    upper = Lanes([float(j & distance) for j in range(LANES)]) > Lanes(0.0)
+    upper = Lanes(_UPPER[distance]) > Lanes(0.0)
     return ti.select(upper, b, a) + ti.select(upper, swapped(b, distance), swapped(a, distance))
 
 

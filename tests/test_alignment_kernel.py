@@ -81,7 +81,7 @@ def run_kernel(settings, T_ml, live, model):
     unused = [np.full((height, width), np.nan)] * 2
     texture = aligned(np.stack([model[name] for name in TEXTURE] + unused, axis=-1))
     parts = alignment.parts(height)
-    scratch = runtime.empty((parts, alignment.SUMS, alignment.LANES))
+    scratch = runtime.empty((parts, alignment.PADDED_SUMS, alignment.LANES))
     packed = runtime.empty((parts, alignment.PACKED_SUMS, alignment.LANES))
     scratch.fill(np.nan)  # every entry must be written
     packed.fill(np.nan)

@@ -15,7 +15,7 @@ CHECKOUT = Path(__file__).resolve().parents[1]
 # What is not listed is an op wrapper: a module round kernels, such as render, losses, images or optim.
 RANKS = (
     {"errors", "geometry", "types"},
-    {"compilation", "kernels", "configs", "config"},
+    {"compilation", "kernels", "configs", "config", "quick_import"},
     {"runtime"},
     {"op wrappers"},
     {"closures", "keyframes", "mapping", "planes", "pose_graph", "synthetic", "tracking"},

@@ -136,6 +136,13 @@ def test_near_cells_have_no_more_than_the_gap_between_them() -> None:
     assert support.near(beside, 0.0).tolist() == [True, False, False, False, False]
 
 
+def test_a_row_of_single_cells_has_an_outline():
+    support = Support(plane_at((0, 0, 1), (0, 0, 0), 0.01), 0.05)
+    support.add(np.column_stack([np.arange(12), np.zeros(12, int)]), keyframe=0)
+    (polygon,) = support.polygons()
+    assert len(polygon) >= 3
+
+
 def test_a_huge_support_gets_coarser_cells_and_keeps_its_area() -> None:
     support = Support(plane_at((0, 0, 1), (0, 0, 0), 0.01), 0.05)
     for start in range(0, 3000, 100):
@@ -195,3 +202,22 @@ def test_the_structure_cue_agrees_with_planes_in_the_cameras_frame(corner: tuple
         local = instance.plane.transformed(T_cw)
         assert local.offset_m > 0  # n points to the camera
         assert_allclose(local.transformed(inverse(T_cw)).offset_m, instance.offset_m)
+
+
+def test_a_strip_of_one_cell_has_an_outline() -> None:
+    (polygon,) = filled((1, 12), plane_at((0, 0, 1), (0, 0, 0), 0.01)).polygons()
+    assert len(polygon) >= 3
+
+
+def test_parts_of_a_support_can_be_taken_from_it() -> None:
+    support = filled((4, 4), plane_at((0, 0, 1), (0, 0, 0), 0.01))
+    support.add(np.array([[0, 6], [1, 6], [2, 7]]), 3)  # the last one touches the others by a corner only
+    kept, other = np.array([[0, 0]]), np.array([[1, 6], [0, 7]])
+    assert not support.connects(kept, other)
+    assert support.connects(kept, np.array([[3, 3]]))
+    places, keyframes = support.take_part(np.array([[1, 6]]), kept)
+    assert_allclose(support.cells_of(places), [[0, 6], [1, 6]])
+    assert keyframes.tolist() == [3, 3]
+    assert len(support) == 17
+    assert support.remove(np.array([[2, 7], [9, 9]])) == 1
+    assert len(support) == 16

@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from tgslam import runtime
 from tgslam.config.schema import PlanesConfig, SyntheticConfig
 from tgslam.datasets.synthetic import SyntheticSource
+from tgslam.plane_fit import CellGrid
+from tgslam.planes.cells import planar_cells
 from tgslam.planes.extraction import extract_planes
 from tgslam.planes.segment import PlaneView, tangents
 from tgslam.types import Camera
@@ -157,6 +159,22 @@ def test_a_wall_behind_a_pillar_is_one(missing_px):
     assert_true(view.segments[0], WALL, 2.5, 0.05, 0.002)
 
 
+@pytest.mark.parametrize("step_m", [0.1, 0.2])
+def test_a_cell_across_an_oblique_step_is_not_plane(step_m):
+    """Its 2 x 2 pixels differ as if it were noise, but those of its neighbours do not."""
+    v, u = np.mgrid[:240, :320]
+    near = v - 120 > 0.4 * (u - 160)
+    noise = SIGMA * np.random.default_rng(0).normal(size=near.shape)
+    depth_m = 1.0 / (1.0 / np.where(near, 3.0 - step_m, 3.0) + noise)
+    grid = CellGrid.across(CAMERA, CONFIG.cells_across)
+    graph = planar_cells(runtime.to_device(np.float32(depth_m)), grid, SIGMA, CONFIG.cell_share, CONFIG.cell_sigmas)
+    rows, columns = grid.shape
+    share = near.reshape(rows, grid.cell_px, columns, grid.cell_px).mean(axis=(1, 3)).ravel()
+    across = (share > 0.25) & (share < 0.75)
+    assert across.sum() > 40 and not across[graph.cell].any()
+    assert len(graph.cell) > 0.95 * len(grid)
+
+
 def test_a_wall_with_an_opening_from_top_to_bottom_is_two():
     exact_m = plane_depth(WALL, 2.0)
     exact_m[:, 140:190] = 3.5
@@ -280,9 +298,9 @@ def test_rooms_under_sensor_noise(sources, scene):
         on_planes = (view.labels >= 0)[(labels >= 0) & (depth_m > 0)].mean()
         assert on_planes > 0.8
         for k, segment in enumerate(view.segments):
-            mine = labels[view.labels == k]
-            most = np.bincount(mine[mine >= 0]).argmax()
             if segment.reliable:
+                mine = labels[view.labels == k]
+                most = np.bincount(mine[mine >= 0]).argmax()
                 normal, offset_m = in_camera(source.planes()[most], source.pose(index))
                 angle_deg = np.degrees(np.arccos(np.clip(normal @ segment.normal_c, -1, 1)))
                 errors.append((angle_deg, 1e3 * abs(normal @ segment.centroid_c + offset_m)))

@@ -163,6 +163,80 @@ def test_a_gap_that_no_view_shows_parts_small_surfaces_only(width_m: float, surf
     assert len(stage.registry.instances) == surfaces
 
 
+def test_far_ends_of_a_floor_are_one_though_nothing_between_them_was_seen() -> None:
+    hall = [
+        replace(FLOOR, centre=(0.0, 1.5, 0.0), size=(14.0, 5.0)),
+        replace(WALL, size=(14.0, 2.5)),
+        replace(SIDE, centre=(-7.0, 1.5, 1.25)),
+        replace(SIDE, centre=(7.0, 1.5, 1.25)),
+    ]
+    stage = Stage(hall)
+    _, left = stage.show(looking((-4.5, 0.0, 1.4), (-6.0, 2.0, 0.2)))
+    _, right = stage.show(looking((4.5, 0.0, 1.4), (6.0, 2.0, 0.2)))
+    assert stage.registry.resolve(left[0][0]) == right[0][0]
+    assert stage.registry.resolve(left[1][0]) == right[1][0]
+    assert len(set(right[0] + right[1])) == 2
+
+
+def test_far_table_tops_are_two_since_the_floor_lies_behind_them() -> None:
+    tops = [Rectangle((x, 2.0, 0.75), (1, 0, 0), (0, 1, 0), (1.6, 0.9)) for x in (-4.0, 4.0)]
+    stage = Stage([*tops, replace(FLOOR, size=(14.0, 6.0))])
+    for x in (-4.0, 4.0):
+        stage.show(looking((x, 0.2, 2.0), (x, 2.01, 0.75)))
+    tables = [plane for plane in stage.registry.instances.values() if abs(plane.offset_m + 0.75) < 0.03]
+    assert len(tables) == 2
+
+
+ROWS = [Rectangle((0.0, 2.8, z), (1, 0, 0), (0, 0, 1), (0.8, 0.3)) for z in (0.9, 1.3)]  # 10 cm apart
+
+
+def test_rows_of_books_stay_apart_where_the_wall_shows_between_them() -> None:
+    stage = Stage([*ROWS, WALL, FLOOR])
+    for x in np.linspace(-0.4, 0.4, 6):
+        seen, ids = stage.show(looking((float(x), 1.0, 1.3), (0.0, 3.0, 1.1)))
+        assert ids[0] != ids[1]
+        assert seen.merged == ()
+    assert stage.registry.parted_from(ids[0][0]) == [stage.registry.instances[ids[1][0]]]
+
+
+@pytest.mark.parametrize(("size", "surfaces"), [((0.8, 0.3), 2), ((2.4, 0.6), 1)])
+def test_a_board_parts_small_fronts_only(size: tuple[float, float], surfaces: int) -> None:
+    height = 0.5 * size[1] + 0.02
+    fronts = [Rectangle((0.0, 2.8, 1.2 + z), (1, 0, 0), (0, 0, 1), size) for z in (-height, height)]
+    board = Rectangle((0.0, 2.75, 1.2), (1, 0, 0), (0, 0, 1), (3.0, 0.06))
+    stage = Stage([*fronts, board, WALL])
+    for x in np.linspace(-0.3, 0.3, 4):
+        _, ids = stage.show(looking((float(x), 0.9, 1.25), (0.0, 3.0, 1.2)))
+    assert len({ids[0][0], ids[1][0]}) == surfaces
+
+
+def test_what_was_taken_for_one_surface_is_parted_when_views_look_through_it() -> None:
+    stage = Stage([*ROWS, WALL, FLOOR])
+    both = Rectangle((0.0, 2.8, 1.1), (1, 0, 0), (0, 0, 1), (0.8, 0.7))
+    _, far = stage.show(looking((0.0, 0.0, 1.3), (0.0, 3.0, 1.1)), rectangles=[both, WALL, FLOOR])
+    for x in np.linspace(-0.3, 0.3, 4):
+        _, ids = stage.show(looking((float(x), 1.0, 1.3), (0.0, 3.0, 1.1)))
+    assert far[0][0] in ids[0] + ids[1]
+    assert ids[0] != ids[1]
+    first, second = (stage.registry.instances[found[0]].support for found in (ids[0], ids[1]))
+    assert not first.holds(first.cells_of(second.centres(second.cells()[0]))).any()
+    assert len(stage.registry.instances) == 4
+
+
+def test_a_bent_piece_becomes_part_of_the_surface_to_which_views_count_it() -> None:
+    bend = np.deg2rad(7.0)
+    bent = Rectangle((1.2, 2.97, 1.2), (np.cos(bend), np.sin(bend), 0), (0, 0, 1), (0.5, 0.5))
+    stage = Stage([WALL, FLOOR])
+    _, ids = stage.show(HERE, rectangles=[WALL, FLOOR, bent])
+    scrap, wall = ids[2][0], ids[0][0]
+    assert scrap != wall
+    merged = [stage.show(T_cw)[0].merged for T_cw in wandering(6)]
+    assert merged.count(((wall, scrap),)) == 1
+    assert merged[0] == merged[1] == ()  # not at the first view
+    assert stage.registry.resolve(scrap) == wall
+    assert_allclose(stage.registry.instances[wall].normal_w, [0, -1, 0], atol=0.005)
+
+
 def test_a_wall_that_something_hides_in_part_is_one() -> None:
     pillar = Rectangle((0.0, 2.0, 1.25), (1, 0, 0), (0, 0, 1), (0.3, 2.5))
     _, ids = Stage([WALL, pillar, FLOOR]).show(HERE)

@@ -244,7 +244,7 @@ class PoseGraph:
 
     def _plane_factor(self, sighting: _Sighting) -> gtsam.CustomFactor:
         keys = _pose(sighting.keyframe), _landmark(sighting.plane_id)
-        noise = self._robust(gtsam.noiseModel.Unit.Create(3))
+        noise = self._robust(gtsam.noiseModel.Isotropic.Sigma(3, self._config.landmark_inflation))
         return gtsam.CustomFactor(noise, list(keys), _PlaneError(keys, sighting.plane))
 
     def _robust(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:

@@ -10,7 +10,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike
 
-from tgslam.compilation import shorten_positions
+from tgslam.compilation import speed_up_translation
 from tgslam.errors import DeviceError
 
 _ALIGNMENT = 64  # bytes, of 16 lanes loaded as one vector
@@ -43,7 +43,7 @@ def start(device: Device = Device.AUTO, threads: int = 0) -> Device:
             )
         return wanted
     threads = threads or available_threads()
-    shorten_positions()
+    speed_up_translation()
     ti.init(
         arch=ti.cuda if wanted is Device.CUDA else ti.cpu,
         default_ip=ti.i32,

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from tgslam import runtime
 from tgslam.config.schema import Config
 from tgslam.depth import measured_share, without_flying_pixels
-from tgslam.errors import FrameError
+from tgslam.errors import ConfigError, FrameError
 from tgslam.geometry import inverse, orthonormalized
 from tgslam.keyframes import KeyframeSelector
 from tgslam.mapping.keyframe import Keyframe
@@ -24,6 +25,9 @@ from tgslam.tracking.motion import ConstantVelocity
 from tgslam.tracking.result import TrackingResult
 from tgslam.tracking.solver import make_tracker, track_or_recover
 from tgslam.types import Camera, Frame, FrameReport, FrameStatus, Gaussians, Plane, Trajectory
+
+if TYPE_CHECKING:
+    from tgslam.closures.closing import GraphClosing
 
 _MIN_DEPTH_SHARE = 0.01  # a frame with depth in fewer of its pixels is not usable
 _FALLBACKS = 3  # latest keyframes from which a lost camera is sought
@@ -51,6 +55,7 @@ class Slam:
             camera, config.mapping, config.seeding, config.loss, rng, config.planes, config.structure
         )  # fmt: skip
         self.structure_cue = StructureCue(config.planes)
+        self.closing = _closing(camera, config)
         self.exposure = Exposure()
         self._posed: list[_Posed] = []
         self._stage_s: dict[str, float] = {}
@@ -129,12 +134,27 @@ class Slam:
         keyframe = Keyframe.from_frame(frame, result.T_cw, result.exposure, result.information)
         with self._stage("map"):
             self.mapper.add_keyframe(keyframe)
+        self._close()
         self._posed.append(_Posed(frame.timestamp_s, keyframe, np.eye(4)))
         self.tracker.rasterizer.forward(self.mapper.gaussians, keyframe.T_cw)
         self.selector.reset(frame, keyframe.T_cw, self.tracker.rasterizer.visible(self.mapper.gaussians.count))
         if self.mapper.planes:
             seen = self.mapper.planes.seen_from(len(self.mapper.keyframes) - 1)
             self.structure_cue.reset(seen, keyframe.T_cw)
+
+    def _close(self) -> None:
+        """Structure closures of the last keyframe: where they correct the graph, map and motion follow."""
+        if not self.closing or not self.mapper.planes:
+            return
+        latest = len(self.mapper.keyframes) - 1
+        with self._stage("graph"):
+            correction = self.closing.add(self.mapper.keyframes, self.mapper.planes.registry)
+        for earlier in correction.closures:
+            self.mapper.viewpoints.link(earlier, latest)
+        if correction.motions:
+            with self._stage("follow"):
+                self.mapper.follow(correction.motions)
+            self.motion.move(correction.motions[latest])
 
     def _remember(self, frame: Frame, T_cw: NDArray[np.float64]) -> None:
         keyframe = self.mapper.keyframes[-1]
@@ -176,6 +196,17 @@ class Slam:
             measures=dict(result.measures),
             message=result.message or cue,
         )
+
+
+def _closing(camera: Camera, config: Config) -> GraphClosing | None:
+    """Imported only where it is used: gtsam takes a while to load. Raises ConfigError for closures without planes."""
+    if not config.closures.enabled:
+        return None
+    if not config.planes.enabled:
+        raise ConfigError("closures.enabled needs planes: set planes.enabled=true as well")
+    from tgslam.closures.closing import GraphClosing
+
+    return GraphClosing(camera, config.loss.depth_sigma_per_m2, config.closures)
 
 
 def _trajectory(timestamps_s: list[float], T_wc: list[NDArray[np.float64]]) -> Trajectory:

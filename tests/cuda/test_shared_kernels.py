@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.cuda.harness import GRIDS, Devices, assert_close
-from tests.cuda.scenarios import adam, closures, images, planes, projection, relaxation
+from tests.cuda.scenarios import adam, closures, images, planes, projection, relaxation, rigid
 from tools.cudacheck.environment import Grid
 
 pytestmark = [pytest.mark.cuda_check, pytest.mark.parametrize("grid", GRIDS)]
@@ -15,6 +15,11 @@ pytestmark = [pytest.mark.cuda_check, pytest.mark.parametrize("grid", GRIDS)]
 def test_relaxation(devices: Devices, grid: Grid) -> None:
     cpu, cuda = devices.both(relaxation.colours, grid)
     assert_close(cuda, cpu, atol=1e-6)
+
+
+def test_rows_that_move(devices: Devices, grid: Grid) -> None:
+    cpu, cuda = devices.both(rigid.rows, grid)
+    assert_close(cuda, cpu, atol=2e-6)
 
 
 def test_adam(devices: Devices, grid: Grid) -> None:

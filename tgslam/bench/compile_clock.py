@@ -15,8 +15,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from taichi._lib import core
-from taichi.lang.kernel_impl import Kernel
+from tgslam.quick_import import quick_import
+
+with quick_import():
+    from taichi._lib import core
+    from taichi.lang.kernel_impl import Kernel
 
 STAGES = ("translate", "compile", "load")
 

@@ -14,6 +14,7 @@ from tgslam.config.schema import Config
 from tgslam.evaluation.planes import ReadIds
 from tgslam.evaluation.protocol import Render
 from tgslam.pipeline import System
+from tgslam.quick_import import quick_import
 from tgslam.types import Camera, Gaussians, Matrix4, Plane
 
 
@@ -26,7 +27,8 @@ def add_device_option(parser: argparse.ArgumentParser) -> None:
 
 def start_device(name: str, threads: int = 0) -> str:
     """Start the kernels on device `name` and return the one in use; 0 threads = all cores. Raises DeviceError."""
-    from tgslam.runtime import Device, start
+    with quick_import():
+        from tgslam.runtime import Device, start
 
     with contextlib.redirect_stdout(io.StringIO()):  # Taichi prints a line that belongs to no result
         return start(Device(name), threads).value
@@ -34,7 +36,8 @@ def start_device(name: str, threads: int = 0) -> str:
 
 def make_system(camera: Camera, config: Config) -> System:
     """The SLAM system for frames of `camera`."""
-    from tgslam.slam import Slam
+    with quick_import():
+        from tgslam.slam import Slam
 
     return Slam(camera, config)
 

@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from tgslam.config.schema import ClosureConfig
+from tgslam.config.schema import ClosureConfig, LoopConfig
 from tgslam.geometry import so3_exp
 from tgslam.planes.estimate import PlaneEstimate, difference
 from tgslam.types import RelativePose
 
 Vector = NDArray[np.float64]
 Lineariser = Callable[[Vector], "Quadratic"]
+Limits = ClosureConfig | LoopConfig  # of which `known_rad` and `known_m` count here
 
 _ITERATIONS = 10
 _SETTLED = 1e-5  # rad and m: a smaller step is none
@@ -95,9 +96,7 @@ def measure(pairs: PlanePairs, prior_T_ji: Vector, config: ClosureConfig) -> Mea
     return solve(lambda T_ji: of_planes(pairs, T_ji), prior_T_ji, config)
 
 
-def solve(
-    linearise: Lineariser, prior_T_ji: Vector, config: ClosureConfig, iterations: int = _ITERATIONS
-) -> Measurement:
+def solve(linearise: Lineariser, prior_T_ji: Vector, config: Limits, iterations: int = _ITERATIONS) -> Measurement:
     """Gauss-Newton over the measured directions: steps have no part in the others."""
     unit, T_ji = _unit(config), prior_T_ji
     for _ in range(iterations):
@@ -136,6 +135,6 @@ def _measured(A: Vector, unit: Vector) -> tuple[Vector, Vector]:
     return vectors[:, known], eigenvalues[known]
 
 
-def _unit(config: ClosureConfig) -> Vector:
+def _unit(config: Limits) -> Vector:
     """[6] the limits `known_rad` and `known_m`."""
     return np.array([config.known_rad] * 3 + [config.known_m] * 3)

@@ -132,7 +132,10 @@ class MappingConfig:
 
     optimizer: str = setting("relaxation", choices=("relaxation", "adam"))  # how colours move; geometry moves by Adam
     window: int = setting(6, 1, 1000)  # latest keyframes refined together
-    window_random: int = setting(2, 0, 1000)  # and with them so many, drawn from all earlier ones
+    anchors: str = setting(
+        "structure", choices=("structure", "random", "none")
+    )  # earlier ones that are refined with it
+    anchor_count: int = setting(2, 0, 1000)  # SGVs, whose poses hold still
     iterations: int = setting(12, 0, 10_000)  # views rendered and refined a keyframe
     final_iterations: int = setting(60, 0, 1_000_000)  # after the last frame, over all keyframes; 0 = off
     refine_poses: bool = setting(True)
@@ -165,7 +168,7 @@ class PlanesConfig:
     join_shift_m: float = setting(0.01, 0.0, 1.0)  # likewise, of depth, on a surface without steps
     across_area_m2: float = setting(0.5, 0.0, 1000.0)  # of the larger of two pieces that something stands before
     pixel_sigmas: float = setting(3.0, 0.5, 100.0)  # of a pixel from its plane
-    min_area_share: float = setting(0.004, 0.0, 1.0)  # of the image
+    min_area_share: float = setting(0.003, 0.0, 1.0)  # of the image
     max_rms_sigmas: float = setting(2.5, 0.1, 100.0)  # residual beyond which a segment is not plane
     max_bend_sigmas: float = setting(0.35, 1e-3, 100.0)  # likewise, of the part that is a paraboloid, and that
     max_bend_m: float = setting(0.005, 1e-5, 1.0)  # in depth; only beyond both a surface is not plane
@@ -242,8 +245,13 @@ class ClosureConfig:
     # A step's error beyond what tracking's residuals show
     odometry_sigma_rad: float = setting(0.001, 1e-7, 1.0)
     odometry_sigma_m: float = setting(0.003, 1e-7, 1.0)
+    # The map follows when a keyframe has moved or turned by so much
+    least_shift_m: float = setting(0.001, 0.0, 1.0)
+    least_turn_rad: float = setting(0.0005, 0.0, 1.0)
     robust: str = setting("cauchy", choices=("none", "huber", "cauchy", "dcs"))  # noise of closures and planes
     robust_sigmas: float = setting(3.0, 0.1, 1000.0)  # beyond which an error counts less
+    # A landmark's views count as this much less certain: where the surface strays from its plane, they all err alike
+    landmark_inflation: float = setting(2.0, 1.0, 100.0)
     relinearise: float = setting(0.01, 0.0, 1.0)  # rad and m; with solver: incremental
     # Structure closures: which keyframes are compared, and what of it becomes an edge
     interval: int = setting(4, 1, 1000)  # k of Table 4: at every k-th keyframe
@@ -261,6 +269,37 @@ class ClosureConfig:
     min_matches: int = setting(60, 1, 1_000_000)  # of them, for their word to count
     match_sigma_rad: float = setting(0.005, 1e-6, 1.0)  # what they have in error together, however many they are
     match_sigma_m: float = setting(0.01, 1e-6, 1.0)
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    """Visual loop closures: keyframes that look the same, whatever the graph says of where they are."""
+
+    enabled: bool = setting(False)  # not part of the method; off, what structure closures do is seen alone
+    features: int = setting(500, 50, 10_000)  # of a keyframe, at most
+    corner_contrast: int = setting(10, 1, 254)  # of FAST corners, steps of 1/255
+    max_bits: int = setting(64, 0, 256)  # of 256 in which descriptors of one point differ
+    ratio: float = setting(0.85, 0.1, 1.0)  # of that to the same for the next best point: more is ambiguous
+    min_gap: int = setting(10, 1, 100_000)  # keyframes between the two
+    candidates: int = setting(4, 2, 100)  # earlier keyframes that are compared with one, the most alike
+    # What makes two keyframes views of one place
+    min_inliers: int = setting(25, 6, 10_000)  # points that agree on one motion, each at a place of its own
+    min_inlier_share: float = setting(0.5, 0.0, 1.0)  # of the points that match by their looks
+    min_depth_agreement: float = setting(0.8, 0.0, 1.0)  # of depth that both views ought to see
+    min_overlap: float = setting(0.2, 0.0, 1.0)  # of the images, where it agrees
+    partner_gap: int = setting(6, 1, 1000)  # keyframes at most between an earlier one and a second that confirms it
+    partner_rad: float = setting(0.03, 1e-4, 3.15)  # by which the two may disagree
+    partner_m: float = setting(0.06, 1e-4, 10.0)
+    understated: float = setting(10.0, 1.0, 1000.0)  # drift may be so many times what the graph believes
+    gate_probability: float = setting(0.99, 0.5, 1.0)  # of a right motion to pass a chi-square test of that
+    # The motion
+    inlier_px: float = setting(3.0, 0.1, 100.0)  # at the finest level of the images, to begin with
+    pixel_sigma: float = setting(0.8, 0.01, 100.0)  # of a feature, likewise
+    model_sigma_m: float = setting(0.005, 1e-5, 1.0)  # of a feature's depth, beyond the sensor's noise
+    common_sigma_rad: float = setting(0.002, 1e-6, 1.0)  # what all features have in error together
+    common_sigma_m: float = setting(0.005, 1e-6, 1.0)
+    known_rad: float = setting(0.02, 1e-4, 10.0)  # a motion known no better than this in any direction is no closure
+    known_m: float = setting(0.05, 1e-4, 10.0)
 
 
 @dataclass(frozen=True)
@@ -287,4 +326,5 @@ class Config:
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
     structure: StructureConfig = dataclasses.field(default_factory=StructureConfig)
     closures: ClosureConfig = dataclasses.field(default_factory=ClosureConfig)
+    loops: LoopConfig = dataclasses.field(default_factory=LoopConfig)
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)

@@ -69,8 +69,8 @@ class SyntheticSource:
         rays = np.sqrt(((u - camera.cx) / camera.fx) ** 2 + ((v - camera.cy) / camera.fy) ** 2 + 1.0)
         facing = camera.fx * camera.fy * np.maximum(view.cosine[on].astype(np.float64), 1e-6) * rays
         pixels_m2 = view.depth_m[on].astype(np.float64) ** 2 / facing
-        areas: NDArray[np.float64] = np.bincount(view.label[on], pixels_m2, minlength=len(self._scene.planes_w))
-        return areas
+        areas = np.bincount(view.label[on], pixels_m2, minlength=len(self._scene.planes_w)).astype(np.float64)
+        return np.asarray(areas, np.float64)
 
     def surface_distance_m(self, points_w: NDArray[np.float64]) -> NDArray[np.float64]:
         """[N] from points [N, 3] m to the nearest surface, exact; inside solids too it is positive."""

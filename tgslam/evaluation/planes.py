@@ -53,7 +53,7 @@ def instance_metrics(
 
     A plane counts when a frame shows `MIN_AREA_M2` of it, in all the frames that show enough of it to speak of. An
     estimated plane that is smaller may match, but is not held against the map when it does not.
-    T_alignment: estimated world to true world, as the trajectories align; without it the errors of the planes are null.
+    T_alignment: estimated world to true world, as the poses align; without it the errors of the planes are null.
     All are null on a request to stop.
     """
     frames, areas_m2 = [], np.zeros(len(truth.planes()))

@@ -28,7 +28,7 @@ from tgslam.evaluation.protocol import (
     image_metrics,
     trajectory_metrics,
 )
-from tgslam.evaluation.trajectory import ate
+from tgslam.evaluation.trajectory import align_poses
 from tgslam.output.log import read_log
 from tgslam.output.planes_io import read_planes
 from tgslam.output.ply import read_map
@@ -158,9 +158,9 @@ def _scene_metrics(
 
 
 def _alignment(estimate: Trajectory, groundtruth: Trajectory, tolerance_s: float) -> Matrix4 | None:
-    """Estimated world to true world; None where too few poses say it."""
+    """Estimated world to true world, by whole poses; None where no pose says it."""
     try:
-        return ate(estimate, groundtruth, tolerance_s).T_alignment
+        return align_poses(estimate, groundtruth, tolerance_s)
     except EvaluationError:
         return None
 

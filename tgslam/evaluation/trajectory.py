@@ -96,6 +96,23 @@ def ate(estimate: Trajectory, groundtruth: Trajectory, tolerance_s: float) -> At
     )
 
 
+def align_poses(estimate: Trajectory, groundtruth: Trajectory, tolerance_s: float) -> Matrix4:
+    """T_ge [4, 4] from the estimate's world to the true one that whole poses agree on best, not only camera centres.
+
+    A camera that hardly moves says little of how the worlds are turned by where it is, but all by where it looks.
+    The rotation is the chordal mean of R_true R_estimated^T. Raises EvaluationError without a pose to compare.
+    """
+    matched, truth = associate(estimate, groundtruth, tolerance_s)
+    if not len(matched):
+        raise EvaluationError(f"none of {len(estimate)} poses has ground truth to be aligned to")
+    turns = truth.T_wc[:, :3, :3] @ np.swapaxes(matched.T_wc[:, :3, :3], 1, 2)
+    left, _, right = np.linalg.svd(turns.sum(axis=0))
+    T = np.eye(4)
+    T[:3, :3] = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    T[:3, 3] = np.mean(truth.T_wc[:, :3, 3] - matched.T_wc[:, :3, 3] @ T[:3, :3].T, axis=0)
+    return T
+
+
 def rpe(estimate: Trajectory, groundtruth: Trajectory, tolerance_s: float, delta_frames: int = 1) -> RpeResult:
     """Relative pose error over every pair of matched poses that are `delta_frames` matches apart.
 

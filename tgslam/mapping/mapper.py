@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import cv2
@@ -12,19 +13,21 @@ from tgslam import images, runtime
 from tgslam.config.schema import LossConfig, MappingConfig, PlanesConfig, SeedingConfig, StructureConfig
 from tgslam.depth import filled
 from tgslam.gaussian_map import GaussianMap
-from tgslam.geometry import inverse, matrix_from_quat_wxyz
+from tgslam.geometry import inverse, matrix_from_quat_wxyz, orthonormalized, transform_points
 from tgslam.mapping.fusion import block_centre, depth_pyramid, fused_depth, sample, turned
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.refinement import Refiner
 from tgslam.mapping.seeding import cell_levels, cell_sizes, quadtree, seed
 from tgslam.mapping.surface import Surface
-from tgslam.types import Camera
+from tgslam.mapping.viewpoints import Viewpoints
+from tgslam.types import Camera, Matrix4
 
 if TYPE_CHECKING:
     from tgslam.mapping.planar import PlanarMapping, PlanarPixels
 
 _MIN_COSINE = 0.1  # a surface more grazing than this says nothing of the depth beside
 _MAX_SLANT = 0.1  # nor one whose depth changes by more within a block
+_NOTICED_M = 0.002  # by which keyframes have moved against each other, for the map between them to be refined
 _MIN_VIEWS = 3  # a Gaussian is judged invisible only after so many views
 
 
@@ -46,6 +49,7 @@ class Mapper:
         self.camera, self.config, self.seeding, self.loss, self.rng = camera, mapping, seeding, loss, rng
         self.gaussians = GaussianMap()
         self.keyframes: list[Keyframe] = []
+        self.viewpoints = Viewpoints(rng)
         self.refiner = Refiner(camera, mapping, loss, structure=structure if self.planes else None)
         self.guessed = np.zeros(0, bool)  # [N] seeded where no depth was measured
         self.information = np.zeros(0)  # [N] 1/m^2, what is known of a Gaussian's depth
@@ -67,6 +71,25 @@ class Mapper:
         self._insert(keyframe, planes)
         if self.planes and planes:
             self.planes.label(self.gaussians, keyframe.T_cw, planes)
+        self._refine_window()
+
+    def follow(self, motions: Mapping[int, Matrix4]) -> None:
+        """Keyframes have moved in the world, p_w <- motions[number] p_w, [4, 4] each; the others stay.
+
+        Their Gaussians and PGIs go with them, the seams are refined, and what now lies twice on one surface goes.
+        """
+        every = np.tile(np.eye(4), (len(self.keyframes), 1, 1))
+        for number, motion in motions.items():
+            every[number] = motion
+            self.keyframes[number].T_cw = orthonormalized(self.keyframes[number].T_cw @ inverse(motion))
+        self.gaussians.move(every)
+        if self.planes:
+            self.planes.follow(self.keyframes)
+            self.refiner.set_planes(self.planes.table())
+        if _bend_m(every, self.keyframes) > _NOTICED_M:
+            self._refine_window()
+
+    def _refine_window(self) -> None:
         for view in self._schedule(self.config.iterations):
             self.refiner.step(self.gaussians, view, move_pose=self._may_move(view))
         self._prune()
@@ -208,18 +231,33 @@ class Mapper:
         self.support, self.conflict = self.support[keep], self.conflict[keep]
 
     def _schedule(self, iterations: int) -> list[Keyframe]:
-        """The views to refine: the latest keyframes in turn, newest first, mixed with random earlier ones."""
-        recent = self.keyframes[-self.config.window :][::-1]
-        earlier = self.keyframes[: -len(recent)]
-        count = min(self.config.window_random, len(earlier))
-        drawn = [earlier[k] for k in self.rng.choice(len(earlier), count, replace=False)] if count else []
-        window = recent + drawn
+        """The views to refine: the latest keyframes in turn, newest first, with some earlier ones (SGVs)."""
+        numbers = range(len(self.keyframes))[-self.config.window :][::-1]
+        window = [self.keyframes[k] for k in [*numbers, *self._anchors(numbers)]]
         return [window[i % len(window)] for i in range(iterations)]
+
+    def _anchors(self, window: Sequence[int]) -> list[int]:
+        """Earlier keyframes to refine with a window, so that it does not leave them behind."""
+        earlier = min(window)
+        count = 0 if self.config.anchors == "none" else min(self.config.anchor_count, earlier)
+        if not count:
+            return []
+        if self.config.anchors == "random" or not self.planes:
+            return [int(k) for k in self.rng.choice(earlier, count, replace=False)]
+        seen_by = {plane_id: instance.keyframes for plane_id, instance in self.planes.instances.items()}
+        return self.viewpoints.choose(count, window, seen_by)
 
     def _may_move(self, keyframe: Keyframe) -> bool:
         """The first keyframe holds the world frame; earlier ones outside the window are anchors."""
         window = self.keyframes[-self.config.window :]
         return self.config.refine_poses and keyframe is not self.keyframes[0] and any(keyframe is k for k in window)
+
+
+def _bend_m(motions: NDArray[np.float64], keyframes: Sequence[Keyframe]) -> float:
+    """By how much motions [K, 4, 4] of keyframes differ, at most, from that of the last one, where each camera is."""
+    places = np.stack([inverse(keyframe.T_cw)[:3, 3] for keyframe in keyframes])
+    before = np.einsum("kij,kj->ki", inverse(motions)[:, :3, :3], places) + inverse(motions)[:, :3, 3]
+    return float(np.linalg.norm(transform_points(motions[-1], before) - places, axis=1).max())
 
 
 def _planar_mapping(camera: Camera, config: PlanesConfig, sigma_per_m2: float) -> PlanarMapping:

@@ -57,12 +57,14 @@ class PlanarMapping:
 
         keyframes: all of the run so far, one more at each call.
         """
-        self._follow(keyframes)
+        self.follow(keyframes)
         keyframe, number = keyframes[-1], len(keyframes) - 1
         self._T_cw.append(keyframe.T_cw.copy())
         depth_m = keyframe.depth_m()
         view = extract_planes(runtime.to_device(depth_m), self.camera, self.config, self.sigma_per_m2)
         observation = self.registry.observe(view, depth_m, self.camera, keyframe.T_cw, number)
+        for earlier in keyframes[:-1]:
+            self._correct(earlier, observation.corrected)
         ids = self._completed(self._closed(observation.id_image(view.labels)), depth_m, keyframe.T_cw)
         pixels = self._pixels(ids, depth_m, keyframe.T_cw)
         keyframe.plane_ids = pixels.ids.astype(np.int16)
@@ -91,7 +93,7 @@ class PlanarMapping:
             plane_ids[named[distance < self.config.max_distance_m]] = plane_id
         gaussians.write("plane_id", slice(0, gaussians.count), plane_ids)
 
-    def _follow(self, keyframes: Sequence[Keyframe]) -> None:
+    def follow(self, keyframes: Sequence[Keyframe]) -> None:
         """Move the PGIs with the keyframes that saw them."""
         corrections = {}
         for number, known in enumerate(self._T_cw):
@@ -102,15 +104,30 @@ class PlanarMapping:
         if corrections:
             self.registry.moved(corrections)
 
+    def _correct(self, keyframe: Keyframe, plane_ids: Sequence[int]) -> None:
+        """A keyframe shows PGIs, parts of which have turned out to be other ones."""
+        assert keyframe.plane_ids is not None
+        shown = [plane_id for plane_id in plane_ids if (keyframe.plane_ids == plane_id).any()]
+        if shown:
+            extents = self._extents(keyframe.depth_m(), keyframe.T_cw)
+            ids = self._divided(keyframe.plane_ids.astype(np.int32), shown, extents)
+            keyframe.plane_ids = ids.astype(np.int16)
+
     def _completed(
         self, ids: NDArray[np.int32], depth_m: NDArray[np.float32], T_cw: NDArray[np.float64]
     ) -> NDArray[np.int32]:
         """What the view's segments say, corrected by what is known of the PGIs from other views."""
-        extents = KnownExtents(self.instances, depth_m, self._rays, T_cw, self.config, self.sigma_per_m2)
-        for plane_id in np.unique(ids[ids != NO_ID]).tolist():
+        extents = self._extents(depth_m, T_cw)
+        return extents.completed(self._divided(ids, np.unique(ids[ids != NO_ID]).tolist(), extents))
+
+    def _divided(self, ids: NDArray[np.int32], plane_ids: Sequence[int], extents: KnownExtents) -> NDArray[np.int32]:
+        for plane_id in plane_ids:
             if others := self.registry.parted_from(plane_id):
                 ids = extents.divided(ids, plane_id, others)
-        return extents.completed(ids)
+        return ids
+
+    def _extents(self, depth_m: NDArray[np.float32], T_cw: NDArray[np.float64]) -> KnownExtents:
+        return KnownExtents(self.instances, depth_m, self._rays, T_cw, self.config, self.sigma_per_m2)
 
     def _pixels(
         self, ids: NDArray[np.int32], measured_m: NDArray[np.float32], T_cw: NDArray[np.float64]

@@ -42,7 +42,7 @@ class Refiner:
         structure: of the terms that planes add (`set_planes`, `Keyframe.plane_ids`); None = planes play no part.
         """
         self.config, self.loss, self.stopwatch = config, loss, stopwatch
-        self.structure = StructureTerms(camera, structure, config.window + config.window_random) if structure else None
+        self.structure = StructureTerms(camera, structure, config.window + config.anchor_count) if structure else None
         self.rasterizer = Rasterizer(camera)
         self.adam = _optimiser(config, camera)
         self._sightings = Sightings()
@@ -149,7 +149,7 @@ class Refiner:
             colour, depth_m = runtime.to_device(keyframe.colour()), runtime.to_device(keyframe.depth_m())
             cached = losses.observe(colour, depth_m, self.loss)
         self._observations[keyframe.index] = cached
-        while len(self._observations) > self.config.window + self.config.window_random:
+        while len(self._observations) > self.config.window + self.config.anchor_count:
             self._observations.popitem(last=False)
         return cached
 

@@ -12,14 +12,14 @@ from tgslam.plane_fit import CellGrid, Floats, Labels
 from tgslam.planes.merging import Agreement, Indices
 from tgslam.planes.moments import joining_cost, planes_of, squared_residuals
 
-_SIGMAS = 4.0  # beyond which a measurement lies before or behind a plane
-_OPEN_SAMPLES = 2  # one after the other behind the plane: a view through, and not a border's ragged pixel
+_SIGMAS = 3.0  # beyond which a measurement lies before or behind a plane
+_RUN = 2  # samples one after the other off the plane: one alone is a border's ragged pixel
 _OPEN_SHARE = 0.2  # of the ways between two pieces, that may be open: their borders need not be parallel
 _CLOSED_SHARE = 0.5  # of the ways that have to be known to be closed; without measurements nothing is known
 _SEEN_SHARE = 0.5  # of a way that is measured when it is known
-_FREE_SHARE = 0.5  # of what is measured between two pieces, not close before their plane: nothing there parts it
+_PARTED_SHARE = 0.5  # of the ways, on which something close before the plane may part it
 _CLOSE_M = 0.15  # before a plane: a board between two fronts; what is farther off only hides part of the view
-_REACH = 1.0  # a gap may be so many times as wide as the larger piece is (root of its area)
+_REACH = 2.5  # a gap may be so many times as wide as the larger piece is (root of its area)
 _LINKS = 48
 _SAMPLES = 16  # along each link, or more where it is longer, in steps of at most a pixel
 _MOST_SAMPLES = 64
@@ -90,7 +90,7 @@ class _Gap:
     """What is seen between two pieces of one plane."""
 
     closed: bool  # nothing behind the plane: they may be one surface
-    free: bool  # mostly the plane itself, or what is far before it: nothing that might part them is close to it
+    free: bool  # nor, mostly, anything close before it that might part them
 
 
 def _gap(
@@ -119,11 +119,16 @@ def _gap(
     behind = seen & (measured - expected < -_SIGMAS * sigma)
     before_m = _offset_m(plane, grid) * (1.0 - expected / measured)
     close = seen & (measured - expected > _SIGMAS * sigma) & (before_m < _CLOSE_M)
-    opened = np.lib.stride_tricks.sliding_window_view(behind, _OPEN_SAMPLES, axis=0).all(axis=-1).any(axis=0)  # [L]
+    opened, parted = _run(behind), _run(behind | close)
     known = ~opened & (seen.sum(axis=0) >= _SEEN_SHARE * between.sum(axis=0))
     closed = opened.mean() <= _OPEN_SHARE and known.mean() >= _CLOSED_SHARE
-    free = (seen & ~close).sum() >= _FREE_SHARE * seen.sum()
-    return _Gap(bool(closed), bool(free))
+    return _Gap(bool(closed), bool(parted.mean() <= _PARTED_SHARE))
+
+
+def _run(samples: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """[L] ways with several of the samples [S, L] one after the other."""
+    windows = np.lib.stride_tricks.sliding_window_view(samples, _RUN, axis=0)
+    return np.asarray(windows.all(axis=-1).any(axis=0))
 
 
 def _links(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> Floats:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from tgslam import plane_fit
 from tgslam.plane_fit import CellGrid, Floats
@@ -30,9 +31,10 @@ def planar_cells(depth_m: np.ndarray, grid: CellGrid, sigma: float, share: float
     """Cells of which at least that share is measured, and whose residual is at most so many times the noise.
 
     The noise is sigma, 1/m, or where neighbouring pixels differ by more at random, as much more as they do: shape does
-    not look like that.
+    not look like that. An oblique step through a cell does, but not through most of the cells around it.
     """
     moments, white = plane_fit.cell_moments(depth_m, grid)
+    white = np.minimum(white, median_filter(white.reshape(grid.shape), 3).ravel())
     variance = np.clip(white, sigma**2, (_NOISIEST * sigma) ** 2)
     count = moments[:, 0]
     fits = squared_residuals(moments) <= sigmas**2 * variance * np.maximum(count - 3, 1.0)

@@ -45,7 +45,8 @@ def extract_planes(depth_m: np.ndarray, camera: Camera, config: PlanesConfig, si
         before = planes
         sums = pixels.sums(before, _CHARBONNIER_SIGMAS * sigma_per_m2)
         planes = refined(before, sums)
-    seen = _evidence(planes, planes - before, sums, grid, sigma_per_m2)
+    fewest_px = max(config.min_area_share * camera.width * camera.height, _FEWEST_PX)
+    seen = _evidence(planes, planes - before, sums, grid, sigma_per_m2, fewest_px)
     found = _judged(seen, noise / sigma_per_m2, grid, config)
     number = np.full(len(planes) + 1, -1, np.int32)
     number[[index for index, _ in found]] = np.arange(len(found))
@@ -75,12 +76,12 @@ def _continuous(graph: CellGraph, agreement: Agreement) -> Indices:
 
 
 def _evidence(
-    planes: Floats, change: Floats, sums: SegmentSums, grid: CellGrid, sigma: float
+    planes: Floats, change: Floats, sums: SegmentSums, grid: CellGrid, sigma: float, fewest_px: float
 ) -> Iterator[tuple[int, Evidence]]:
-    """Index and evidence of those planes that have pixels in more than a line; change: [P, 3] since the sums."""
+    """Index and evidence of the planes with enough pixels, in more than a line; change: [P, 3] since the sums."""
     for index in range(len(planes)):
         rows = sums.of(index)
-        if rows.pixels.sum() >= _FEWEST_PX and width_px(rows.moments.sum(axis=0)) >= 1.0:
+        if rows.pixels.sum() >= fewest_px and width_px(rows.moments.sum(axis=0)) >= 1.0:
             yield index, evidence(planes[index], change[index], rows, grid, sigma)
 
 
@@ -88,11 +89,10 @@ def _judged(
     candidates: Iterable[tuple[int, Evidence]], noise_sigmas: Floats, grid: CellGrid, config: PlanesConfig
 ) -> list[tuple[int, PlaneSegment]]:
     """Index and segment of the largest ones that are planes. noise_sigmas: [P] the noise as the sensor's standard."""
-    found, image_px = [], grid.camera.width * grid.camera.height
+    found = []
     for index, seen in candidates:
-        large = seen.segment.area_px >= config.min_area_share * image_px
         smooth = seen.segment.rms_sigmas <= config.max_rms_sigmas * noise_sigmas[index]
-        if large and smooth and _bend(seen, config) <= 1.0:
+        if smooth and _bend(seen, config) <= 1.0:
             reliable = _is_reliable(seen, grid, config)
             found.append((index, dataclasses.replace(seen.segment, reliable=reliable)))
     found.sort(key=lambda item: (-item[1].area_px, item[0]))

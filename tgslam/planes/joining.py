@@ -104,13 +104,16 @@ class Joining:
         why parts of them are the same surface even when all between them is yet to be seen.
         """
         large, _ = _by_extent(a, b)
+        least_m2 = self._config.bridge_area_m2
+        if large.area_m2 < least_m2:
+            return False
         behind_m2 = other_m2 = 0.0
         for other in everything:
             if other is not a and other is not b and other.id != NO_ID:
                 heights_m = large.plane.heights_m(other.support.centres(other.support.cells()[0]))
                 behind_m2 += float(np.mean(heights_m < -self._config.max_distance_m)) * other.area_m2
                 other_m2 += other.area_m2
-        return min(large.area_m2, other_m2) >= self._config.bridge_area_m2 and behind_m2 <= _BEHIND_SHARE * other_m2
+        return other_m2 >= least_m2 and behind_m2 <= _BEHIND_SHARE * other_m2
 
     def overruled(self, matching: ViewMatching, seen: Collection[PlanarInstance]) -> list[Pair]:
         """(larger, smaller) instances where view after view counts to the larger one all that it shows of the smaller.

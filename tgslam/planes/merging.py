@@ -13,7 +13,7 @@ from tgslam.planes.moments import NOISE, joining_cost, squared_residuals
 Indices = NDArray[np.intp]
 
 _OVER_MEDIAN = 2.0  # three standard deviations: the median of chi-square of 3 degrees is 2.4, its 99 % quantile 11.3
-_ABSORBED = 8.0  # a set of so many times the points hardly changes by what it takes in
+_ABSORBED = 4.0  # a set of so many times the points hardly changes by what it takes in
 
 
 @dataclass(frozen=True)

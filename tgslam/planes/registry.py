@@ -29,6 +29,7 @@ class Observation:
     created: tuple[int, ...]  # PGIs that this keyframe made or confirmed
     merged: tuple[tuple[int, int], ...]  # (kept, absorbed)
     removed: tuple[int, ...]
+    corrected: tuple[int, ...]  # PGIs that have lost a part of their extent to one that a gap parts from them
 
     def id_image(self, labels: NDArray[np.int32]) -> NDArray[np.int32]:
         """The PGI of each pixel [H, W], -1 = none, for the labels of the PlaneView: id(u) of Eq. 2."""
@@ -80,7 +81,10 @@ class PlaneRegistry:
 
     def parted_from(self, plane_id: int) -> list[PlanarInstance]:
         """The PGIs level with one that a gap parts from it."""
-        return [other for other in self._joining.parted_from(self.instances[plane_id]) if other.id in self.instances]
+        known = self.instances
+        if plane_id not in known:
+            return []
+        return [other for other in self._joining.parted_from(known[plane_id]) if other.id in known]
 
     def observe(
         self, view: PlaneView, depth_m: FloatImage, camera: Camera, T_cw: NDArray[np.float64], keyframe: int
@@ -92,14 +96,15 @@ class PlaneRegistry:
         self._poses[keyframe] = inverse(T_cw)
         samples = Samples.of(view, depth_m, camera, T_cw, self._config.mask_width_px)
         matching = ViewMatching(samples, self._instances, self._config, self._tolerance)
-        self._match(matching, keyframe)
+        corrected = self._match(matching, keyframe)
         seen = self._integrate(matching, keyframe)
         created = self._confirm(seen, matching)
         removed = self._weigh_contradictions(matching, seen)
         created += self._split(seen)
         merged = [*self._overrule(matching, seen), *self._merge(seen, samples)]
         ids = [self._id_of(owner, keyframe) for owner in matching.owner]
-        return Observation(keyframe, np.array(ids, np.int32), tuple(created), tuple(merged), tuple(removed))
+        shrunk = tuple(sorted({instance.id for instance in corrected if instance.id != NO_ID}))
+        return Observation(keyframe, np.array(ids, np.int32), tuple(created), tuple(merged), tuple(removed), shrunk)
 
     def moved(self, corrections: Poses) -> tuple[tuple[int, int], ...]:
         """Keyframes have moved in the world: p_w <- corrections[keyframe] p_w, [4, 4] each; the others stay.
@@ -114,27 +119,43 @@ class PlaneRegistry:
             instance.move(corrections, self._poses)
         return tuple(self._merge(affected, None))
 
-    def _match(self, matching: ViewMatching, keyframe: int) -> None:
-        """Give every segment its instance; new ones for those that neither overlap nor continue one that there is."""
+    def _match(self, matching: ViewMatching, keyframe: int) -> set[PlanarInstance]:
+        """Give every segment its instance; new ones for those that neither overlap nor continue one that there is.
+
+        Returns with the instances that have lost a part of their extent.
+        """
         for careful in (True, False):
             for segment, instance in matching.overlapping(careful):
                 self._give(matching, segment, instance, keyframe)
+        corrected: set[PlanarInstance] = set()
         for segment in range(len(matching.segments)):
             if matching.owner[segment] is None:
                 found = matching.continued(segment)
                 if found is None:
                     found = PlanarInstance(matching.world(segment), self._config)
-                    self._part(segment, found, matching)
+                    corrected |= self._part(segment, found, matching)
                 self._give(matching, segment, found, keyframe)
+        return corrected | self._divide(matching)
 
     def _give(self, matching: ViewMatching, segment: int, instance: PlanarInstance, keyframe: int) -> None:
         matching.give(segment, instance, keyframe, self._joining.parted_from(instance))
 
-    def _part(self, segment: int, new: PlanarInstance, matching: ViewMatching) -> None:
+    def _part(self, segment: int, new: PlanarInstance, matching: ViewMatching) -> set[PlanarInstance]:
         """Take from the instances that were thought to go on over a gap what lies beyond, where that parts them."""
-        for instance in matching.parted(segment):
+        parted = matching.parted(segment)
+        for instance in parted:
             new.support.absorb(*matching.beyond_gap(segment, instance))
             self._joining.part(instance, new)
+        return set(parted)
+
+    def _divide(self, matching: ViewMatching) -> set[PlanarInstance]:
+        """Where a view shows both of two parted instances, what it shows of the one is no part of the other."""
+        corrected = set()
+        for segment, owner in enumerate(matching.owner):
+            for other in self._joining.parted_from(owner) if owner is not None else ():
+                if matching.pieces(other) and other.support.remove(matching.samples.footprint(segment, other.support)):
+                    corrected.add(other)
+        return corrected
 
     def _integrate(self, matching: ViewMatching, keyframe: int) -> list[PlanarInstance]:
         """Hand each instance its view; returns the instances in view, oldest first."""

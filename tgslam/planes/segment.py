@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam.geometry import hat
+
 Vector = NDArray[np.float64]
 
 
@@ -35,7 +37,7 @@ class PlaneView:
 
 def tangents(normal: Vector) -> Vector:
     """[2, 3] unit vectors, right-handed with the normal [3]: the axes that a segment's covariance speaks of."""
-    helper = np.eye(3)[np.argmin(np.abs(normal))]
-    first = np.cross(helper, normal)
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(normal, first)])
+    cross = hat(normal)  # row k is e_k x normal
+    first = cross[np.argmin(np.abs(normal))]
+    first = first / np.linalg.norm(first)
+    return np.stack([first, cross @ first])

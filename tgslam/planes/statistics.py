@@ -147,5 +147,5 @@ def _curvature(hessian: Floats, segment: PlaneSegment, grid: CellGrid) -> float:
     z, focal = segment.centroid_c[2], np.array([grid.camera.fx, grid.camera.fy])
     slope = segment.normal_c[:2] / (segment.normal_c @ segment.centroid_c)  # of 1/z, per unit of x/z and y/z
     steps = np.vstack([np.eye(2), np.zeros(2)]) * z - np.outer(segment.centroid_c * z, slope)  # of the point, per same
-    to_plane = np.linalg.inv(np.array(tangents(segment.normal_c)) @ steps / focal)
+    to_plane = np.linalg.inv(tangents(segment.normal_c) @ steps / focal)
     return float(np.abs(np.linalg.eigvalsh(segment.offset_m * z * to_plane.T @ hessian @ to_plane)).max())

@@ -15,6 +15,7 @@ _MAX_EVIDENCE = 20  # so that what has moved away can be forgotten in reasonable
 _MAX_SIDE = 1024  # cells; a larger grid gets cells twice the size
 _OUTLINE_SCALE = 2  # outlines are traced at this many pixels a cell
 _MIN_OUTLINE_CELLS = 4
+_MIN_CORNERS = 3  # a strip of one cell may be simplified to a line
 
 
 class Support:
@@ -116,6 +117,12 @@ class Support:
         rows, columns = (cells[self.holds(cells)] - self._low).T
         self._evidence[rows, columns] -= 1
 
+    def remove(self, cells: Cells) -> int:
+        """Cells [N, 2] are no part of the surface; how many of them were."""
+        rows, columns = (cells[self.holds(cells)] - self._low).T
+        self._evidence[rows, columns] = 0
+        return len(rows)
+
     def follow(self, plane: PlaneEstimate) -> None:
         """Lay the grid onto the plane as it is estimated now, turned no more than needed."""
         self.origin = self.origin - plane.heights_m(self.origin) * plane.normal
@@ -140,7 +147,7 @@ class Support:
         contours = cv2.findContours(fine, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
         contours = [c for c in contours if cv2.contourArea(c) >= _MIN_OUTLINE_CELLS * scale**2]
         contours.sort(key=cv2.contourArea, reverse=True)
-        return [self._outline(cv2.approxPolyDP(c, scale / 2, True)[:, 0, ::-1], pad) for c in contours]
+        return [self._outline(_simplified(c, scale / 2)[:, 0, ::-1], pad) for c in contours]
 
     def _outline(self, pixels: NDArray[np.int32], pad: int) -> Vector:
         """Pixels [K, 2] (row, column) of the fine mask as points [K, 3]: rows go along the first axis."""
@@ -169,6 +176,12 @@ class Support:
         self._cover(coarse.min(axis=0), coarse.max(axis=0) + 1)
         rows, columns = (coarse - self._low).T
         self._evidence[rows, columns], self._keyframe[rows, columns] = evidence[first], keyframes[first]
+
+
+def _simplified(contour: NDArray[np.int32], tolerance: float) -> NDArray[np.int32]:
+    """A contour [K, 1, 2] with fewer corners, or as it is where only a line would be left: a row of single cells."""
+    simple = np.asarray(cv2.approxPolyDP(contour, tolerance, True), np.int32)
+    return simple if len(simple) > 2 else contour
 
 
 def _lookup(grid: NDArray[np.uint8], index: Cells) -> NDArray[np.bool_]:

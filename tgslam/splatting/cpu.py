@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from tgslam import runtime
 from tgslam.gaussian_map import GaussianMap, MapGradient
-from tgslam.kernels import projection, rasterize
+from tgslam.kernels import projection, projection_gradient, rasterize
 from tgslam.kernels.simd import CHUNK, CHUNKS, LANES, PER_ROW, TILE
 from tgslam.splatting.images import ImageGradient, RenderImages
 from tgslam.stopwatch import Stopwatch, stage
@@ -40,6 +40,7 @@ class _SplatBuffers:
         self.tile_rect = runtime.empty((capacity, 4), np.int32)
         self.tile_count = runtime.zeros((capacity,), np.int32)
         self.first_of = runtime.zeros((capacity,), np.int32)
+        self.by_depth = runtime.empty((capacity, 4), np.int32)
 
 
 class CpuSplatting:
@@ -58,7 +59,7 @@ class CpuSplatting:
         self._slots = _SlotBuffers(1 << 15, self.tiles)
         self._splats = _SplatBuffers(1)
         self._start = runtime.zeros((self.tiles + 1,), np.int32)
-        self._per_tile = runtime.zeros((self.tiles, rasterize.SEGMENTS), np.int32)
+        self._per_tile = runtime.zeros((rasterize.SEGMENTS, self.tiles + self.tiles_x + 1), np.int32)
         self.slot_count = 0
 
     @property
@@ -105,10 +106,10 @@ class CpuSplatting:
                 n, splats.tile_count, splats.first_of, embedding, slots.grad, slots.embedding_grad, splats.moments
             )
         with stage(self.stopwatch, "unproject"):
-            blocks = runtime.zeros((max(1, -(-n // projection.POSE_BLOCK)), 6))
-            projection.project_backward(
+            blocks = runtime.zeros((max(1, -(-n // projection_gradient.POSE_BLOCK)), 6))
+            projection_gradient.project_backward(
                 n, gaussians.mean, gaussians.log_scale, gaussians.quat_wxyz, gaussians.opacity_logit,
-                gaussians.embedding, pose, self._camera, self.camera.width, self.camera.height, embedding,
+                splats.splat, pose, self._camera, self.camera.width, self.camera.height, embedding,
                 splats.tile_count, splats.moments.reshape(splats.capacity, -1),
                 into.mean, into.log_scale, into.quat_wxyz, into.opacity_logit, into.colour, into.embedding,
                 into.curvature, blocks,
@@ -137,14 +138,16 @@ class CpuSplatting:
         np.subtract(ends, tile_count, out=splats.first_of[:count])
         visible = np.flatnonzero(tile_count)
         order = _depth_order(runtime.to_host(splats.splat)[visible, projection.Z], visible)
-        rasterize.count_slots(len(order), order, splats.tile_rect, self.tiles_x, self._per_tile)
-        ends = np.cumsum(self._per_tile, dtype=np.int32)
-        self._start[1:] = ends[rasterize.SEGMENTS - 1 :: rasterize.SEGMENTS]
-        cursor = (ends - self._per_tile.ravel()).reshape(self._per_tile.shape)
+        rasterize.count_slots(
+            len(order), order, splats.tile_rect, splats.first_of, self.tiles_x, splats.by_depth, self._per_tile
+        )
+        per_tile = self._per_tile[:, : self.tiles]
+        cursor = np.cumsum(per_tile, 0, dtype=np.int32)
+        np.cumsum(cursor[-1], out=self._start[1:])
+        cursor += self._start[:-1] - per_tile
         rasterize.fill_slots(
-            len(order), order, splats.tile_rect, self.tiles_x, cursor, splats.first_of,
-            self._slots.ids, self._slots.entry,
-        )  # fmt: skip
+            len(order), order, splats.by_depth, self.tiles_x, cursor, self._slots.ids, self._slots.entry
+        )
         return self._slots
 
 

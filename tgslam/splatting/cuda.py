@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from tgslam import runtime
 from tgslam.gaussian_map import GaussianMap, MapGradient
-from tgslam.kernels import projection
+from tgslam.kernels import projection, projection_gradient
 from tgslam.kernels.cuda import rasterize, scan
 from tgslam.kernels.cuda.block import WARPS
 from tgslam.kernels.cuda.warp import WARP
@@ -29,7 +29,7 @@ class _SplatBuffers:
         self.tile_count = runtime.zeros((capacity,), np.int32)
         self.by_depth = Pairs(capacity)  # depth bits, Gaussian
         self.first_of = runtime.empty((capacity + 1,), np.int32)  # in depth order
-        self.pose_rows = runtime.empty((max(1, -(-capacity // projection.POSE_BLOCK)), 6))
+        self.pose_rows = runtime.empty((max(1, -(-capacity // projection_gradient.POSE_BLOCK)), 6))
 
 
 class CudaSplatting:
@@ -94,9 +94,9 @@ class CudaSplatting:
                 splats.moments,
             )  # fmt: skip
         with stage(self.stopwatch, "unproject"):
-            projection.project_backward(
+            projection_gradient.project_backward(
                 gaussians.count, gaussians.mean, gaussians.log_scale, gaussians.quat_wxyz, gaussians.opacity_logit,
-                gaussians.embedding, pose, self._camera, self.camera.width, self.camera.height, embedding,
+                splats.splat, pose, self._camera, self.camera.width, self.camera.height, embedding,
                 splats.tile_count, splats.moments, into.mean, into.log_scale, into.quat_wxyz, into.opacity_logit,
                 into.colour, into.embedding, into.curvature, splats.pose_rows,
             )  # fmt: skip

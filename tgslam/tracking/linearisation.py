@@ -47,7 +47,7 @@ class _CpuKernels:
 
     def __init__(self, camera: Camera) -> None:
         parts = alignment.parts(camera.height)
-        self._scratch = runtime.empty((parts, alignment.SUMS, alignment.LANES), lanes=True)
+        self._scratch = runtime.empty((parts, alignment.PADDED_SUMS, alignment.LANES), lanes=True)
         self._packed = runtime.empty((parts, alignment.PACKED_SUMS, alignment.LANES), lanes=True)
 
     def sums(self, settings: np.ndarray, live: LiveLevel, model: ModelLevel) -> NDArray[np.float64]:

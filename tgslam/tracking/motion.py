@@ -28,6 +28,11 @@ class ConstantVelocity:
             self._velocity = se3_log(T_cw @ inverse(self._last[1])) / (timestamp_s - self._last[0])
         self._last = (timestamp_s, T_cw)
 
+    def move(self, motion: NDArray[np.float64]) -> None:
+        """The world around the camera has moved, p_w <- motion p_w [4, 4]; its velocity is as it was."""
+        if self._last is not None:
+            self._last = (self._last[0], self._last[1] @ inverse(motion))
+
     def slow_down(self) -> None:
         """Believe in half the velocity: where tracking is lost, the last one soon tells nothing."""
         self._velocity = self._velocity / 2.0

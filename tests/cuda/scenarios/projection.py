@@ -7,7 +7,7 @@ import numpy as np
 from tests.cuda.harness import scenario
 from tgslam import runtime
 from tgslam.geometry import se3_exp
-from tgslam.kernels import projection
+from tgslam.kernels import projection, projection_gradient
 
 _WIDTH, _HEIGHT = 50, 37
 _CAMERA = (45.0, 48.0, 24.3, 18.9)
@@ -42,14 +42,14 @@ def forward_and_backward(count: int = 300, with_embedding: bool = True) -> dict[
     )  # fmt: skip
     rng = np.random.default_rng(1)
     moments = runtime.to_device(rng.normal(size=(count, projection.MOMENTS)))
-    blocks = -(-count // projection.POSE_BLOCK)
+    blocks = -(-count // projection_gradient.POSE_BLOCK)
     shapes = {
         "mean": (count, 3), "log_scale": (count, 3), "quat": (count, 4), "logit": (count,), "colour": (count, 3),
         "embedding": (count, 3), "curvature": (count, 2), "pose": (blocks, 6),
     }  # fmt: skip
     gradients = {name: runtime.zeros(shape) for name, shape in shapes.items()}
-    projection.project_backward(
-        count, mean, log_scale, quat, logit, embedding, pose, camera, _WIDTH, _HEIGHT, with_embedding,
+    projection_gradient.project_backward(
+        count, mean, log_scale, quat, logit, splat, pose, camera, _WIDTH, _HEIGHT, with_embedding,
         tile_count, moments, *gradients.values(),
     )  # fmt: skip
     results = {"splat": splat, "tile_rect": tile_rect, "tile_count": tile_count}

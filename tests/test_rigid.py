@@ -1,0 +1,70 @@
+"""Rigid motion of the map: the twin, and a map that moves with its camera."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.reference import rigid as reference
+from tgslam import runtime
+from tgslam.gaussian_map import GaussianMap
+from tgslam.geometry import inverse, quat_wxyz_from_matrices, se3_exp
+from tgslam.kernels import rigid
+from tgslam.render import Rasterizer
+from tgslam.types import Camera, Gaussians
+
+CAMERA = Camera(48, 40, 60.0, 60.0, 23.5, 19.5)
+
+
+def gaussians(count: int, births: int, seed: int = 0) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    return Gaussians(
+        mean=(rng.normal(size=(count, 3)) * [0.4, 0.3, 0.2] + [0, 0, 2]).astype(np.float32),
+        log_scale=rng.uniform(-4, -2.5, (count, 3)).astype(np.float32),
+        quat_wxyz=rng.normal(size=(count, 4)).astype(np.float32),
+        opacity_logit=rng.uniform(-1, 3, count).astype(np.float32),
+        colour=rng.random((count, 3)).astype(np.float32),
+        embedding=np.zeros((count, 3), np.float32),
+        plane_id=np.full(count, -1, np.int32),
+        birth_keyframe=rng.integers(0, births, count).astype(np.int32),
+    )
+
+
+def test_rows_match_the_twin() -> None:
+    given_rows, rng = gaussians(300, 4), np.random.default_rng(1)
+    motions = np.stack([se3_exp(rng.normal(size=6)) for _ in range(4)])
+    mean, quat = runtime.to_device(given_rows.mean.copy()), runtime.to_device(given_rows.quat_wxyz.copy())
+    rigid.move_rows(
+        200, runtime.to_device(given_rows.birth_keyframe, np.int32),
+        runtime.to_device(quat_wxyz_from_matrices(motions[:, :3, :3])),
+        runtime.to_device(motions[:, :3].reshape(-1, 12)), mean, quat,
+    )  # fmt: skip
+    moved, turned = reference.move_rows(given_rows.birth_keyframe, motions, given_rows.mean, given_rows.quat_wxyz)
+    np.testing.assert_allclose(runtime.to_host(mean)[:200], moved[:200], atol=2e-6)
+    np.testing.assert_allclose(runtime.to_host(quat)[:200], turned[:200], atol=2e-6)
+    np.testing.assert_array_equal(runtime.to_host(mean)[200:], given_rows.mean[200:])
+
+
+@given(st.lists(st.floats(-2, 2), min_size=6, max_size=6))
+def test_a_map_and_a_camera_that_move_together_see_the_same(xi: list[float]) -> None:
+    motion, rasterizer = se3_exp(xi), Rasterizer(CAMERA)
+    still = GaussianMap.from_gaussians(gaussians(80, 1))
+    before = rasterizer.render(still, np.eye(4))
+    still.move(motion[None])
+    after = rasterizer.render(still, inverse(motion))
+    np.testing.assert_allclose(after.colour, before.colour, atol=2e-4)
+    np.testing.assert_allclose(after.opacity, before.opacity, atol=2e-4)
+
+
+def test_each_row_follows_its_own_keyframe() -> None:
+    moving = GaussianMap.from_gaussians(gaussians(50, 2))
+    before = moving.gaussians()
+    lift = np.stack([np.eye(4), np.eye(4)])
+    lift[1, 1, 3] = 0.5
+    moving.move(lift)
+    after = moving.gaussians()
+    shift = after.mean - before.mean
+    np.testing.assert_allclose(shift[:, 1], 0.5 * before.birth_keyframe, atol=1e-6)
+    np.testing.assert_allclose(shift[:, [0, 2]], 0.0, atol=1e-6)
+    np.testing.assert_allclose(after.quat_wxyz, before.quat_wxyz, atol=1e-6)

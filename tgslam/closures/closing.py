@@ -1,0 +1,123 @@
+"""Keeps the pose graph in step with the keyframes: their odometry and planes go in, corrected poses come out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tgslam.closures.icp import View
+from tgslam.closures.search import ClosureSearch
+from tgslam.config.schema import ClosureConfig
+from tgslam.geometry import inverse
+from tgslam.mapping.keyframe import Keyframe
+from tgslam.planes.estimate import PlaneEstimate
+from tgslam.planes.instance import NO_ID
+from tgslam.planes.registry import PlaneRegistry
+from tgslam.pose_graph import PoseGraph
+from tgslam.types import Camera, Matrix4, RelativePose
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What a keyframe has changed in the graph."""
+
+    motions: dict[int, Matrix4]  # p_w <- motion p_w, for the keyframes that have moved; empty = stay where you are
+    closures: tuple[int, ...]  # earlier keyframes to which it has an edge now
+
+
+class GraphClosing:
+    """Owns the pose graph.
+
+    The map's keyframes are refined between corrections, so what the graph says is applied as a motion: of its estimate
+    now against its estimate when the map last followed.
+    """
+
+    def __init__(self, camera: Camera, depth_sigma_per_m2: float, config: ClosureConfig) -> None:
+        """depth_sigma_per_m2: the sensor's noise, sigma_z = this * z^2."""
+        self._config = config
+        self._graph = PoseGraph(config)
+        self._search = ClosureSearch(camera, depth_sigma_per_m2, config) if config.formulation != "landmarks" else None
+        self._applied: list[NDArray[np.float64]] = []  # T_cw of the graph that the map follows
+        self._sighted: dict[int, set[int]] = {}  # PGI -> keyframes whose sightings are in the graph
+
+    @property
+    def closure_count(self) -> int:
+        """Structure closures in the graph."""
+        return self._graph.closure_count
+
+    def add(self, keyframes: Sequence[Keyframe], planes: PlaneRegistry) -> Correction:
+        """Take in the last keyframe, mapped and with its planes observed. Raises GraphError without a solution."""
+        latest = len(keyframes) - 1
+        self._add_odometry(keyframes)
+        if self._config.formulation != "closures":
+            self._add_sightings(planes)
+        estimate = self._graph.optimise()
+        closures = self._add_closures(keyframes, planes, estimate.T_cw) if latest else ()
+        if closures:
+            estimate = self._graph.optimise()
+        return Correction(self._motions(estimate.T_cw), closures)
+
+    def _add_odometry(self, keyframes: Sequence[Keyframe]) -> None:
+        latest, T_cw = len(keyframes) - 1, keyframes[-1].T_cw
+        if latest == 0:
+            self._graph.add_first(0, T_cw)
+            self._applied.append(T_cw.copy())
+            return
+        T_ji = T_cw @ inverse(keyframes[-2].T_cw)
+        self._graph.add_keyframe(latest, latest - 1, RelativePose(T_ji, keyframes[-1].information))
+        self._applied.append(T_ji @ self._applied[-1])
+
+    def _add_sightings(self, planes: PlaneRegistry) -> None:
+        """What is new; everything anew where PGIs have merged, split or ended."""
+        instances = planes.instances
+        gone = self._sighted.keys() - instances.keys()
+        split = any(i.split_from is not None for k, i in instances.items() if k not in self._sighted)
+        if gone or split:
+            self._sighted = {plane_id: set(instance.keyframes) for plane_id, instance in instances.items()}
+            self._graph.replace_planes({k: planes.seen_from(k) for k in range(len(self._applied))})
+            return
+        for plane_id, instance in instances.items():
+            known = self._sighted.setdefault(plane_id, set())
+            for keyframe in instance.keyframes:
+                view = None if keyframe in known else instance.view(keyframe)
+                if view is not None:
+                    self._graph.add_plane_observation(keyframe, plane_id, view)
+            known.update(instance.keyframes)
+
+    def _add_closures(
+        self, keyframes: Sequence[Keyframe], planes: PlaneRegistry, T_cw: NDArray[np.float64]
+    ) -> tuple[int, ...]:
+        """Edges from the latest keyframe to earlier ones that see the same planes."""
+        latest = len(keyframes) - 1
+        if self._search is None or latest % self._config.interval:
+            return ()
+        sightings: dict[int, Mapping[int, PlaneEstimate]] = {k: planes.seen_from(k) for k in range(latest + 1)}
+
+        def view(keyframe: int) -> View:
+            return View(keyframes[keyframe].depth_m(), _resolved(keyframes[keyframe].plane_ids, planes))
+
+        found = self._search.find(sightings, dict(enumerate(T_cw)), self._graph.relative, view)
+        for closure in found.closures:
+            self._graph.add_closure(closure.earlier, latest, closure.measured.motion)
+        return tuple(closure.earlier for closure in found.closures)
+
+    def _motions(self, T_cw: NDArray[np.float64]) -> dict[int, Matrix4]:
+        """Of all keyframes once one of them has moved enough to matter."""
+        motions = inverse(T_cw) @ np.stack(self._applied)
+        shifts_m = np.linalg.norm(inverse(T_cw)[:, :3, 3] - inverse(np.stack(self._applied))[:, :3, 3], axis=1)
+        turns_rad = np.linalg.norm(motions[:, :3, :3] - np.eye(3), axis=(1, 2)) / np.sqrt(2.0)
+        if shifts_m.max() < self._config.least_shift_m and turns_rad.max() < self._config.least_turn_rad:
+            return {}
+        self._applied = [T.copy() for T in T_cw]
+        return dict(enumerate(motions))
+
+
+def _resolved(plane_ids: NDArray[np.int16] | None, planes: PlaneRegistry) -> NDArray[np.int32]:
+    """[H, W] of a keyframe, under the ids that PGIs have by now."""
+    assert plane_ids is not None  # closures are looked for only where planes are
+    known, place = np.unique(plane_ids, return_inverse=True)
+    now = np.array([planes.resolve(int(i)) if i >= 0 else NO_ID for i in known], np.int32)
+    return now[place].reshape(plane_ids.shape)

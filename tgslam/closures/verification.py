@@ -1,0 +1,160 @@
+"""Are two keyframes that look alike views of one place, and what is the motion between them?
+
+Features that match by their looks must agree on one motion, which RANSAC finds and robust Gauss-Newton refines on
+their pixels and depths, each weighted by its noise in both views. All of the two depth images must agree on it too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tgslam.closures.depth_agreement import DepthGrid, agreement
+from tgslam.closures.features import Features, matches
+from tgslam.closures.relative import Measurement, Quadratic, solve
+from tgslam.config.schema import LoopConfig
+from tgslam.geometry import transform_points
+from tgslam.types import Camera
+
+Vector = NDArray[np.float64]
+
+_RANSAC_ROUNDS = 300
+_CONFIDENCE = 0.999
+_FIRST_STEPS = 3  # before it is decided anew which features agree
+_ROBUST_SIGMAS = 3.0  # beyond which a feature counts less
+_INLIER_SIGMAS = 4.0  # of three coordinates
+_PLACES_ACROSS = 40  # the image: features in one of its squares are one
+
+
+@dataclass(frozen=True)
+class Look:
+    """What is kept of a keyframe."""
+
+    features: Features
+    depth: DepthGrid
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Features [N] that match, with their noise."""
+
+    in_i: Vector  # [N, 3] m
+    covariance_i: Vector  # [N, 3, 3] m^2
+    seen_j: Vector  # [N, 3] px, px, m
+    variance_j: Vector  # [N, 3]
+
+    def __getitem__(self, rows: NDArray[np.generic]) -> _Points:
+        return _Points(self.in_i[rows], self.covariance_i[rows], self.seen_j[rows], self.variance_j[rows])
+
+
+@dataclass(frozen=True)
+class Sameness:
+    """A verified pair of keyframes."""
+
+    measured: Measurement  # in all six directions
+    inliers: int  # features that agree on it, at different places
+
+
+class Verification:
+    """The tests of a pair, with what all pairs have in common."""
+
+    def __init__(self, camera: Camera, depth_sigma_per_m2: float, config: LoopConfig) -> None:
+        """depth_sigma_per_m2: the sensor's noise, sigma_z = this * z^2."""
+        self._camera, self._sigma, self._config = camera, depth_sigma_per_m2, config
+
+    def compare(self, look_i: Look, look_j: Look) -> Sameness | None:
+        """None unless the geometry speaks for one place beyond doubt."""
+        config = self._config
+        pairs = matches(look_i.features, look_j.features, config)
+        if len(pairs) < config.min_inliers:
+            return None
+        points = self._points(look_i.features, look_j.features, pairs)
+        T_ji, agree = self._sampled(points)
+        if agree.sum() < config.min_inliers:
+            return None
+        measured = solve(partial(self._of_points, points[agree]), T_ji, config, _FIRST_STEPS)
+        agree = self._squares(points, measured.T_ji) < _INLIER_SIGMAS**2
+        if agree.mean() < config.min_inlier_share or self._places(points.seen_j[agree]) < config.min_inliers:
+            return None
+        measured = solve(partial(self._of_points, points[agree]), measured.T_ji, config)
+        agreeing, overlap = agreement(look_i.depth, look_j.depth, measured.T_ji, self._sigma)
+        if measured.rank < 6 or agreeing < config.min_depth_agreement or overlap < config.min_overlap:
+            return None
+        return Sameness(measured, self._places(points.seen_j[agree]))
+
+    def _points(self, in_i: Features, in_j: Features, pairs: NDArray[np.int64]) -> _Points:
+        """A feature's noise is that of its pixel, which the level of the pyramid scales, and of its depth."""
+        camera, (i, j) = self._camera, pairs.T
+        points = in_i.points(camera)[i]
+        rays = points / points[:, 2:]
+        along = points[:, 2] / np.array([[camera.fx], [camera.fy]])  # m per px
+        variance_i, variance_j = self._variance(in_i)[i], self._variance(in_j)[j]
+        covariance = variance_i[:, 2, None, None] * rays[:, :, None] * rays[:, None, :]
+        for axis in range(2):
+            covariance[:, axis, axis] += variance_i[:, axis] * along[axis] ** 2
+        seen_j = np.column_stack([in_j.pixels, in_j.depth_m]).astype(np.float64)[j]
+        return _Points(points, covariance, seen_j, variance_j)
+
+    def _variance(self, features: Features) -> Vector:
+        """[N, 3] px^2, px^2, m^2."""
+        pixel = (self._config.pixel_sigma * features.scale.astype(np.float64)) ** 2
+        depth = (self._sigma * features.depth_m.astype(np.float64) ** 2) ** 2 + self._config.model_sigma_m**2
+        return np.column_stack([pixel, pixel, depth])
+
+    def _sampled(self, points: _Points) -> tuple[Vector, NDArray[np.bool_]]:
+        """A motion [4, 4] that many points agree on, by their pixels, and which they are; RANSAC seeds itself."""
+        camera = self._camera
+        K = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+        found, rotation, shift, rows = cv2.solvePnPRansac(
+            points.in_i, points.seen_j[:, :2], K, None, iterationsCount=_RANSAC_ROUNDS,
+            reprojectionError=self._config.inlier_px, confidence=_CONFIDENCE, flags=cv2.SOLVEPNP_SQPNP,
+        )  # fmt: skip
+        T_ji, agree = np.eye(4), np.zeros(len(points.in_i), np.bool_)
+        if found and rows is not None and np.isfinite(rotation).all() and np.isfinite(shift).all():
+            T_ji[:3, :3], T_ji[:3, 3] = cv2.Rodrigues(rotation)[0], shift[:, 0]
+            agree[rows[:, 0]] = True
+        return T_ji, agree
+
+    def _errors(self, points: _Points, T_ji: Vector) -> tuple[Vector, Vector, Vector]:
+        """Of (px, px, m) in j: [N, 3], their covariances [N, 3, 3] and derivatives [N, 3, 6] by a left perturbation."""
+        camera = self._camera
+        p = transform_points(T_ji, points.in_i)
+        z = np.maximum(p[:, 2], 1e-3)  # what has come to lie behind the camera has errors that count for nothing
+        by_point = np.zeros((len(p), 3, 3))
+        by_point[:, 0, 0], by_point[:, 0, 2] = camera.fx / z, -camera.fx * p[:, 0] / z**2
+        by_point[:, 1, 1], by_point[:, 1, 2] = camera.fy / z, -camera.fy * p[:, 1] / z**2
+        by_point[:, 2, 2] = 1.0
+        seen = np.column_stack([camera.fx * p[:, 0] / z + camera.cx, camera.fy * p[:, 1] / z + camera.cy, p[:, 2]])
+        turned = by_point @ T_ji[:3, :3]
+        covariance = turned @ points.covariance_i @ np.swapaxes(turned, 1, 2)
+        covariance[:, range(3), range(3)] += points.variance_j
+        moved = np.tile(np.eye(3, 6, 3), (len(p), 1, 1))  # [N, 3, 6] the point's derivatives: -hat(p), 1
+        moved[:, [1, 2, 0], [2, 0, 1]] = p
+        moved[:, [2, 0, 1], [1, 2, 0]] = -p
+        return seen - points.seen_j, covariance, by_point @ moved
+
+    def _squares(self, points: _Points, T_ji: Vector) -> Vector:
+        """[N] squared Mahalanobis distances."""
+        error, covariance, _ = self._errors(points, T_ji)
+        return np.sum(error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0], axis=1)
+
+    def _of_points(self, points: _Points, T_ji: Vector) -> Quadratic:
+        """What the points say near T_ji, with Cauchy weights, and no more than their common error leaves of it."""
+        error, covariance, jacobian = self._errors(points, T_ji)
+        white = np.linalg.solve(covariance, np.concatenate([jacobian, error[:, :, None]], axis=2))
+        squares = np.sum(error * white[:, :, 6], axis=1)
+        white = white / (1.0 + squares[:, None, None] / _ROBUST_SIGMAS**2)
+        A, b = np.einsum("nki,nkj->ij", jacobian, white[:, :, :6]), np.einsum("nki,nk->i", jacobian, white[:, :, 6])
+        config = self._config
+        limit = np.array([config.common_sigma_rad] * 3 + [config.common_sigma_m] * 3) ** -2.0
+        share = np.linalg.solve(A + np.diag(limit), np.column_stack([A, b])) * limit[:, None]
+        return Quadratic(share[:, :6], share[:, 6], float(squares.sum()), 3 * len(error))
+
+    def _places(self, seen: Vector) -> int:
+        """How many squares of the image hold any of the pixels [N, 3]."""
+        squares = seen[:, :2] // (self._camera.width / _PLACES_ACROSS)
+        return len(np.unique(squares, axis=0))
