@@ -18,7 +18,7 @@ from tgslam.bench.ablation import jobs, table, workers
 from tgslam.bench.ablation.studies import STUDIES, Column, Study, Variant
 from tgslam.cli import main
 from tgslam.config.loader import load
-from tgslam.config.schema import Config, MappingConfig
+from tgslam.config.schema import Config
 from tgslam.errors import ClusterError, ConfigError
 from tgslam.evaluation.run_metrics import METRIC_KEYS
 from tgslam.output.run_folder import RunFolder, RunState
@@ -76,13 +76,7 @@ def runs_of(result: dict[str, Any]) -> list[dict[str, Any]]:
 # What the studies ask for
 
 
-def named(study: Study) -> Any:
-    needs_anchors = any("mapping.anchors" in text for variant in study.variants for text in variant.overrides)
-    here = not needs_anchors or hasattr(MappingConfig, "anchors")
-    return pytest.param(study, id=study.name, marks=pytest.mark.skipif(not here, reason="no setting mapping.anchors"))
-
-
-@pytest.mark.parametrize("study", [named(study) for study in STUDIES.values()])
+@pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
 def test_every_variant_is_a_config_of_its_own(study: Study) -> None:
     configs = [load(None, study.overrides(variant)) for variant in study.variants]
     assert all(first != second for n, first in enumerate(configs) for second in configs[:n])
