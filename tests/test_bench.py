@@ -301,9 +301,11 @@ def test_run_compiles_once_and_leaves_nothing(tmp_path: Path, monkeypatch, capsy
 
 
 def test_ablation_reports_every_identity_and_draws_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    picture = tmp_path / "planes.png"
-    arguments = ("--scene", "desk", "--frame", "3", "--size", "96x64", "--output", str(picture))
-    result = run_json("ablation", *arguments, "--threads", "1", "--quiet")
+    picture = tmp_path / "identity-desk.png"
+    arguments = ("identity", "--scene", "desk", "--frame", "3", "--size", "96x64", "--output", str(tmp_path))
+    found = run_json("ablation", *arguments, "--threads", "1", "--quiet")
+    (result,) = found["identity"]
+    assert json.loads(picture.with_suffix(".json").read_text()) == result
     assert result["iterations"][0] == 0
     assert set(result["curves"]) == {"colour", "scalar"}
     for curve in result["curves"].values():
@@ -314,10 +316,10 @@ def test_ablation_reports_every_identity_and_draws_them(tmp_path: Path, capsys: 
     assert image is not None
     assert image.shape[0] == 2 * 64
     assert image.shape[1] % 96 == 0
-    report.print_ablation(result)
-    out = capsys.readouterr().out
-    assert "colour ids" in out
-    assert f"{result['curves']['scalar']['wrong'][-1]:.2%}" in out
+    report.print_ablation(found)
+    for text in (capsys.readouterr().out, picture.with_suffix(".md").read_text()):
+        assert "colour ids" in text
+        assert f"{result['curves']['scalar']['wrong'][-1]:.2%}" in text
 
 
 def test_graph_reports_every_size(capsys: pytest.CaptureFixture[str]) -> None:

@@ -50,7 +50,7 @@ def world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> World:
         return world.source
 
     monkeypatch.setattr(inputs, "open_source", open_source)
-    monkeypatch.setattr(engine, "start_device", lambda name: "cpu")
+    monkeypatch.setattr(engine, "start_device", lambda name, threads=0: "cpu")
     monkeypatch.setattr(engine, "make_system", lambda camera, config: world.system)
     monkeypatch.setattr(engine, "make_render", lambda camera: fake_render)
     monkeypatch.setattr(engine, "make_read_ids", lambda camera, ids, config: fake_read_ids)

@@ -8,7 +8,7 @@ import pytest
 from tests.reference import instance_field as reference
 from tests.test_loss_kernels import assert_gradient, central
 from tgslam import instance_field, runtime
-from tgslam.bench import ablation
+from tgslam.bench.ablation import identity
 from tgslam.config.schema import StructureConfig
 from tgslam.kernels import instance_field as kernels
 from tgslam.planes import palette
@@ -175,11 +175,11 @@ def test_scalar_ids_are_rounded():
 
 
 def test_colours_learn_planes_faster_and_better_than_scalars():
-    found = ablation.measure("room", 0, (160, 120))
+    found = identity.measure("room", 0, (160, 120))
     colour, scalar = (curve.wrong for curve in found.curves)
-    at = ablation.ITERATIONS.index
+    at = identity.ITERATIONS.index
     assert colour[0] > 0.9 and scalar[0] > 0.9  # neutral
     assert colour[at(1)] < 0.5 * scalar[at(1)]
     assert colour[at(40)] < 0.7 * scalar[at(40)]
     assert colour[at(5)] < 0.2 and colour[at(40)] <= colour[at(5)]
-    assert ablation.picture(found).shape == (240, 800, 3)
+    assert identity.picture(found).shape == (240, 800, 3)

@@ -25,6 +25,10 @@ class DeviceError(TgslamError):
     """A compute device that was asked for and is not there."""
 
 
+class ClusterError(TgslamError):
+    """A Dask cluster that was asked for and cannot be used."""
+
+
 class TrackingError(TgslamError):
     """Tracking cannot start or cannot go on."""
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import tgslam
 from tgslam import runtime
+from tgslam.bench.ablation import table
 from tgslam.bench.run import CACHES
 from tgslam.output.console import print_columns
 
@@ -117,19 +118,17 @@ def print_run(result: dict[str, Any]) -> None:
 
 
 def print_ablation(result: dict[str, Any]) -> None:
-    """Wrong pixels of each identity by iteration."""
+    """A table for each study and input; runs that failed are named below it."""
     print_machine(result["machine"])
-    curves = result["curves"]
-    rows = [
-        (str(iteration), *(f"{curve['wrong'][number]:.2%}" for curve in curves.values()))
-        for number, iteration in enumerate(result["iterations"])
-    ]
-    print_columns(
-        f"pixels whose plane is read wrongly, frame {result['frame']} of {_name(result)} with {result['planes']} "
-        f"planes, {result['gaussians']:,} Gaussians",
-        ("iterations", *(f"{identity} ids" for identity in curves)),
-        rows,
-    )
+    for frame in result["identity"]:
+        print()
+        titles, *body = table.identity_rows(frame)
+        print_columns(table.identity_heading(frame), titles, body)
+    for found in result["tables"]:
+        print()
+        print_columns(table.heading(found), table.header(found), table.rows(found))
+        for failure in table.failed_runs(found):
+            print(f"  failed: {failure}")
 
 
 def print_graph(result: dict[str, Any]) -> None:

@@ -10,12 +10,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tgslam.cli import engine
+from tgslam.cli import bench_ablation, engine
 from tgslam.cli.inputs import open_frames, parse_frames, resolve_config
-from tgslam.cli.options import add_log_options
+from tgslam.cli.options import add_log_options, add_thread_count, positive, size
 from tgslam.errors import ConfigError, EvaluationError
 from tgslam.output.console import error_console
-from tgslam.output.images import write_colour
 from tgslam.output.progress import frame_progress, step_progress
 
 if TYPE_CHECKING:
@@ -26,7 +25,6 @@ _COUNTS = [20_000, 67_000, 200_000, 500_000]
 _SIZE, _COUNT = (640, 480), 67_000
 _KEYFRAMES = [500, 2000]
 _DEPTH_SCALE = 5000.0
-_LEAST_PX, _MOST_PX = 16, 8192
 
 
 def add_parser(commands: Any) -> argparse.ArgumentParser:
@@ -38,7 +36,7 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
         "by stage; or compare ways of learning which plane is where.",
     )
     benchmarks = parser.add_subparsers(metavar="BENCHMARK", required=True)
-    for add in (_add_render, _add_map, _add_track, _add_run, _add_ablation, _add_graph):
+    for add in (_add_render, _add_map, _add_track, _add_run, bench_ablation.add_parser, _add_graph):
         benchmark = add(benchmarks)
         benchmark.add_argument("--json", action="store_true", help="print everything as JSON instead of tables")
         add_log_options(benchmark, default=argparse.SUPPRESS)
@@ -50,7 +48,14 @@ def execute(args: argparse.Namespace) -> int:
     result = args.measure(args)
     if args.json:
         print(json.dumps(result, indent=2, allow_nan=False))
-        return 0
+    else:
+        _print(result)
+    if result.get("failed"):
+        raise EvaluationError(f"{result['failed']} of {result['runs']} runs failed; the table says why")
+    return 0
+
+
+def _print(result: dict[str, Any]) -> None:
     from tgslam.bench import report
 
     printers = {
@@ -58,7 +63,6 @@ def execute(args: argparse.Namespace) -> int:
         "ablation": report.print_ablation, "graph": report.print_graph,
     }  # fmt: skip
     printers[result["benchmark"]](result)
-    return 0
 
 
 def _add_render(benchmarks: Any) -> argparse.ArgumentParser:
@@ -71,20 +75,20 @@ def _add_render(benchmarks: Any) -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--size",
-        type=_size,
+        type=size,
         nargs="+",
         default=_SIZES,
         metavar="WxH",
         help=f"images of the room (default: {' '.join(f'{width}x{height}' for width, height in _SIZES)})",
     )
     parser.add_argument(
-        "--gaussians", type=_positive, nargs="+", default=_COUNTS, metavar="N", help="in the room, about (default: "
+        "--gaussians", type=positive, nargs="+", default=_COUNTS, metavar="N", help="in the room, about (default: "
         f"{' '.join(map(str, _COUNTS))})",
     )  # fmt: skip
     _add_frame_options(parser)
     _add_repeats(parser, 20)
     parser.add_argument(
-        "--threads", type=_positive, nargs="+", metavar="N",
+        "--threads", type=positive, nargs="+", metavar="N",
         help="CPU threads; several take turns, in a process each (default: 1, and all cores)",
     )  # fmt: skip
     parser.set_defaults(measure=_measure_render)
@@ -98,13 +102,13 @@ def _add_map(benchmarks: Any) -> argparse.ArgumentParser:
         description="Time an iteration of the map's refinement on the built-in room and, if it is given, on an RGB-D "
         "frame with a Gaussian at every second pixel.",
     )
-    parser.add_argument("--size", type=_size, default=_SIZE, metavar="WxH", help="image of the room (default: 640x480)")
+    parser.add_argument("--size", type=size, default=_SIZE, metavar="WxH", help="image of the room (default: 640x480)")
     parser.add_argument(
-        "--gaussians", type=_positive, default=_COUNT, metavar="N", help="in the room, about (default: %(default)s)"
+        "--gaussians", type=positive, default=_COUNT, metavar="N", help="in the room, about (default: %(default)s)"
     )
     _add_frame_options(parser)
     _add_repeats(parser, 20)
-    _add_thread_count(parser)
+    add_thread_count(parser)
     parser.set_defaults(measure=_measure_map)
     return parser
 
@@ -117,7 +121,7 @@ def _add_track(benchmarks: Any) -> argparse.ArgumentParser:
         "with a tracked frame.",
     )
     _add_sequence_options(parser, frames=":30")
-    _add_thread_count(parser)
+    add_thread_count(parser)
     parser.set_defaults(measure=_measure_track)
     return parser
 
@@ -134,22 +138,6 @@ def _add_run(benchmarks: Any) -> argparse.ArgumentParser:
     return parser
 
 
-def _add_ablation(benchmarks: Any) -> argparse.ArgumentParser:
-    parser: argparse.ArgumentParser = benchmarks.add_parser(
-        "ablation",
-        help="instance colours against scalar ids",
-        description="Learn the true planes of one frame of a built-in scene, as colours of a palette and as scalar "
-        "ids, and count the pixels that are read wrongly after 0 to 40 iterations.",
-    )
-    parser.add_argument("--scene", default="room", metavar="NAME", help="a built-in scene (default: room)")
-    parser.add_argument("--frame", type=_natural, default=0, metavar="N", help="of the scene (default: 0)")
-    parser.add_argument("--size", type=_size, default=_SIZE, metavar="WxH", help="of the image (default: 640x480)")
-    parser.add_argument("--output", type=Path, metavar="PNG", help="write what is read, and the truth, as a picture")
-    _add_thread_count(parser)
-    parser.set_defaults(measure=_measure_ablation)
-    return parser
-
-
 def _add_graph(benchmarks: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = benchmarks.add_parser(
         "graph",
@@ -158,12 +146,12 @@ def _add_graph(benchmarks: Any) -> argparse.ArgumentParser:
         "each. Every graph has a process of its own, whose peak memory is told.",
     )
     parser.add_argument(
-        "--keyframes", type=_positive, nargs="+", default=_KEYFRAMES, metavar="N",
+        "--keyframes", type=positive, nargs="+", default=_KEYFRAMES, metavar="N",
         help=f"of each graph (default: {' '.join(map(str, _KEYFRAMES))})",
     )  # fmt: skip
-    parser.add_argument("--planes", type=_positive, default=40, metavar="N", help="of a graph (default: %(default)s)")
+    parser.add_argument("--planes", type=positive, default=40, metavar="N", help="of a graph (default: %(default)s)")
     parser.add_argument(
-        "--sightings", type=_positive, default=6, metavar="N", help="planes that a keyframe sees (default: %(default)s)"
+        "--sightings", type=positive, default=6, metavar="N", help="planes that a keyframe sees (default: %(default)s)"
     )
     parser.set_defaults(measure=_measure_graph)
     return parser
@@ -194,15 +182,11 @@ def _add_sequence_options(parser: argparse.ArgumentParser, frames: str | None) -
 def _add_repeats(parser: argparse.ArgumentParser, default: int) -> None:
     parser.add_argument(
         "--repeats",
-        type=_positive,
+        type=positive,
         default=default,
         metavar="R",
         help="measurements of each case (default: %(default)s)",
     )
-
-
-def _add_thread_count(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--threads", type=_positive, metavar="N", help="CPU threads (default: all cores)")
 
 
 def _measure_render(args: argparse.Namespace) -> dict[str, Any]:
@@ -312,30 +296,6 @@ def _measure_run(args: argparse.Namespace) -> dict[str, Any]:
     return {"benchmark": "run", "machine": report.machine(), "arguments": arguments, "runs": runs}
 
 
-def _measure_ablation(args: argparse.Namespace) -> dict[str, Any]:
-    from tgslam.bench import ablation, report
-
-    threads = _start(args)
-    with step_progress("identity", len(ablation.IDENTITIES), error_console(), args.quiet) as step:
-        found = ablation.measure(args.scene, args.frame, args.size, step)
-    if args.output is not None:
-        write_colour(args.output, ablation.picture(found))
-    width, height = found.size
-    return {
-        "benchmark": "ablation",
-        "machine": report.machine(),
-        "threads": threads,
-        "scene": found.scene,
-        "frame": found.frame,
-        "width": width,
-        "height": height,
-        "planes": found.planes,
-        "gaussians": found.gaussians,
-        "iterations": list(ablation.ITERATIONS),
-        "curves": {curve.identity: {"wrong": curve.wrong, "loss": curve.loss} for curve in found.curves},
-    }
-
-
 def _measure_graph(args: argparse.Namespace) -> dict[str, Any]:
     from tgslam.bench import graph, report
     from tgslam.config.schema import ClosureConfig
@@ -372,22 +332,3 @@ def _frame(args: argparse.Namespace) -> tuple[Camera, Frame] | None:
 
 def _middle(values: Sequence[Any]) -> Any:
     return values[(len(values) - 1) // 2]
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.partition("x")
-    if not all(side.isdecimal() and _LEAST_PX <= int(side) <= _MOST_PX for side in (width, height)):
-        raise argparse.ArgumentTypeError(f"{text!r} is not WIDTHxHEIGHT with sides of {_LEAST_PX} to {_MOST_PX} px")
-    return int(width), int(height)
-
-
-def _natural(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 0 or more")
-    return int(text)
-
-
-def _positive(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 1 or more")
-    return int(text)

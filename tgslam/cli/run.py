@@ -14,6 +14,7 @@ from tgslam import __version__, pipeline
 from tgslam.cli import engine
 from tgslam.cli.inputs import open_frames, parse_frames, resolve_config
 from tgslam.cli.interrupt import StopRequest
+from tgslam.cli.options import natural
 from tgslam.cli.summary import print_metrics
 from tgslam.config.schema import Config
 from tgslam.datasets.source import RgbdSource
@@ -46,6 +47,9 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
     parser.add_argument("--overwrite", action="store_true", help="replace the run that --output holds")
     parser.add_argument("--no-final", action="store_true", help="leave out the final refinement of the map")
     engine.add_device_option(parser)
+    parser.add_argument(
+        "--threads", type=natural, default=0, metavar="N", help="CPU threads (default: 0, which is all cores)"
+    )
     return parser
 
 
@@ -54,7 +58,7 @@ def execute(args: argparse.Namespace) -> int:
     started_s = time.perf_counter()
     config = resolve_config(args.config, args.input, args.set)
     frames = parse_frames(args.frames)
-    device = engine.start_device(args.device)
+    device = engine.start_device(args.device, args.threads)
     source = open_frames(config, args.input, frames)
     path = args.output or fresh_folder(Path("runs"), source.name, datetime.now())
     folder = RunFolder.create(path, args.overwrite)

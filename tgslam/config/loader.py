@@ -36,6 +36,11 @@ def load(path_or_name: Path | None = None, overrides: Sequence[str] = ()) -> Con
     if path_or_name is not None:
         for path, mapping in _chain_of_files(find_config(path_or_name)):
             config = _apply(config, mapping, where=str(path), prefix="")
+    return override(config, overrides)
+
+
+def override(config: Config, overrides: Sequence[str]) -> Config:
+    """`config` with "section.key=value" of `overrides`; see `load`. Raises ConfigError."""
     for text in overrides:
         config = _apply(config, _mapping_of_override(text), where=f"--set {text}", prefix="")
     return config
