@@ -137,6 +137,17 @@ class TestFeatures:
         assert len(matches(a, twice(100.0), CONFIG)) == 0
         assert len(matches(a, twice(1.0), CONFIG)) == 20  # one corner found twice
 
+    def test_spread_over_the_image(self) -> None:
+        """One busy corner takes no more than its share."""
+        rng = np.random.default_rng(0)
+        picture = np.full((240, 320), 0.5, np.float32)
+        picture[40:200:20, 40:280:20] = 0.7
+        picture[40:80, 40:80] = np.kron(rng.uniform(0, 1, (10, 10)), np.ones((4, 4)))
+        found = Detector(replace(CONFIG, features=100)).detect(
+            np.repeat(picture[..., None], 3, 2), np.ones_like(picture)
+        )
+        assert len(found) == 100 and (found.pixels > 85).any(axis=1).mean() > 0.5
+
     @pytest.mark.parametrize("shape", [(240, 320), (20, 24)])
     def test_no_texture_gives_none(self, shape: tuple[int, int]) -> None:
         empty = Detector(CONFIG).detect(np.full((*shape, 3), 0.5, np.float32), np.ones(shape, np.float32))
@@ -230,6 +241,27 @@ class TestVerification:
         verification = Verification(CAMERA, DEPTH_SIGMA_PER_M2, replace(CONFIG, min_inlier_share=0.0))
         assert verification.compare(look(frame), look(frame)) is not None
         assert verification.compare(look(frame), look(there)) is None
+
+    def test_one_thing_seen_twice_is_no_place(self) -> None:
+        """Such as a door: depth agrees, and its features do, but those round it are missing."""
+        rng = np.random.default_rng(0)
+        pattern, other = (np.kron(rng.uniform(0.2, 0.8, (60, 80)), np.ones((4, 4))).astype("f4") for _ in range(2))
+        other[80:165, 90:205] = pattern[80:165, 90:205]
+        wall = np.full((240, 320), 2.0, np.float32)
+        here, there = (look(Frame(0, 0.0, np.repeat(p[..., None], 3, 2), wall)) for p in (pattern, other))
+        few = replace(CONFIG, min_inliers=10, known_rad=0.1, known_m=0.2)
+        same = Verification(CAMERA, DEPTH_SIGMA_PER_M2, replace(few, min_seen_again=0.0)).compare(here, there)
+        assert same is not None
+        assert_allclose(same.measured.T_ji, np.eye(4), atol=0.01)
+        verification = Verification(CAMERA, DEPTH_SIGMA_PER_M2, few)
+        assert verification.compare(here, there) is None
+        assert verification.compare(here, here) is not None
+
+    def test_another_exposure(self) -> None:
+        first, second = walk("room", 2, 8).frames
+        darker = replace(second, colour=second.colour * np.float32(0.7))
+        same = Verification(CAMERA, DEPTH_SIGMA_PER_M2, CONFIG).compare(look(first), look(darker))
+        assert same is not None and same.inliers > 40
 
     def test_no_more_is_known_than_all_features_have_in_error_together(self) -> None:
         for same in self.compared("room", 2, 8):
