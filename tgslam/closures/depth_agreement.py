@@ -52,16 +52,18 @@ def agreement(
     """Which part of the points that either view should see of the other's lie on its surface; and the least part of
     an image's pixels for which that is so. Points behind a surface are hidden, and speak neither for nor against.
     """
-    ahead = _compared(in_i.points(), T_ji, in_j, depth_sigma_per_m2)
-    back = _compared(in_j.points(), inverse(T_ji), in_i, depth_sigma_per_m2)
+    ahead = compared(in_i.points(), T_ji, in_j, depth_sigma_per_m2)
+    back = compared(in_j.points(), inverse(T_ji), in_i, depth_sigma_per_m2)
     on, before = ahead[0] + back[0], ahead[1] + back[1]
     return on / max(on + before, 1), min(ahead[0] / in_i.depth_m.size, back[0] / in_j.depth_m.size)
 
 
-def _compared(
+def compared(
     points: NDArray[np.float64], T: NDArray[np.float64], other: DepthGrid, depth_sigma_per_m2: float
 ) -> tuple[int, int]:
-    """How many of the points [N, 3] lie on the other view's surface, and how many in front of it."""
+    """How many points [N, 3] m, which T [4, 4] takes to the other view's frame, lie on its surface, and how many in
+    front of it.
+    """
     camera = other.camera
     moved = transform_points(T, points)
     moved = moved[moved[:, 2] > 0.0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -13,6 +14,8 @@ from tgslam.images import DEPTH_EDGE
 from tgslam.types import Camera, FloatImage
 
 _LEVEL_RATIO = 1.2  # of ORB's image pyramid
+_SURPLUS = 4  # so many times more corners are found than are kept
+_SQUARES_ACROSS = 20  # the image, over which they are spread
 _PATCH = np.mgrid[-1:2, -1:2].reshape(2, -1)  # (dv, du) px of 3 x 3 neighbours
 _DUPLICATE_PX = 6.0  # one corner is found on several levels; nearer features are no rivals of each other
 _UNLIKE = 257  # bits: no two descriptors differ in more than 256
@@ -37,24 +40,26 @@ class Features:
 
 
 class Detector:
-    """ORB with the config's number of features."""
+    """ORB with the config's number of features, spread over the image."""
 
     def __init__(self, config: LoopConfig) -> None:
-        self._orb = cv2.ORB.create(config.features, _LEVEL_RATIO, fastThreshold=config.corner_contrast)
+        self._count = config.features
+        self._orb = cv2.ORB.create(_SURPLUS * config.features, _LEVEL_RATIO, fastThreshold=config.corner_contrast)
 
     def detect(self, colour: FloatImage, depth_m: FloatImage) -> Features:
         """Features of colour [H, W, 3] in [0, 1] whose neighbourhood in depth [H, W] m is measured and continuous."""
-        found, descriptors = self._orb.detectAndCompute(grey_image(colour), None)
-        if not found:
+        grey = grey_image(colour)
+        corners = self._orb.detect(grey, None)
+        if corners:
+            smooth = np.flatnonzero(_depth_at(_pixels(corners), depth_m)[1])
+            strength = np.array([corners[int(k)].response for k in smooth])
+            chosen = smooth[_spread(_pixels(corners)[smooth], strength, depth_m.shape[1], self._count)]
+            corners, descriptors = self._orb.compute(grey, [corners[int(k)] for k in chosen])
+        if not corners:
             none = np.zeros(0, np.float32)
             return Features(none.reshape(0, 2), none, none, np.zeros((0, 32), np.uint8))
-        scale = np.array([_LEVEL_RATIO**point.octave for point in found])
-        # ORB multiplies a level's coordinates by its scale, which takes pixel corners to pixel corners, not centres
-        pixels = np.array([point.pt for point in found]) + 0.5 * (scale[:, None] - 1.0)
-        depth, smooth = _depth_at(pixels, depth_m)
-        return Features(
-            pixels[smooth].astype(np.float32), scale[smooth].astype(np.float32), depth[smooth], descriptors[smooth]
-        )
+        pixels = _pixels(corners)
+        return Features(pixels, _scales(corners), _depth_at(pixels, depth_m)[0], descriptors)
 
 
 def grey_image(colour: FloatImage) -> NDArray[np.uint8]:
@@ -88,7 +93,30 @@ def _differences(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.int16
     return bits
 
 
-def _depth_at(pixels: NDArray[np.float64], depth_m: FloatImage) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _scales(corners: Sequence[cv2.KeyPoint]) -> NDArray[np.float32]:
+    """[N] of their pyramid levels."""
+    return np.array([_LEVEL_RATIO**corner.octave for corner in corners], np.float32)
+
+
+def _pixels(corners: Sequence[cv2.KeyPoint]) -> NDArray[np.float32]:
+    """[N, 2] px. ORB multiplies a level's coordinates by its scale, which takes pixel corners to pixel corners, and
+    centres beside centres.
+    """
+    corrected: NDArray[np.float32] = cv2.KeyPoint.convert(corners) + np.float32(0.5) * (_scales(corners)[:, None] - 1)
+    return corrected
+
+
+def _spread(pixels: NDArray[np.float32], strength: NDArray[np.float64], width: int, count: int) -> NDArray[np.int64]:
+    """Rows of at most `count` pixels [N, 2]: the strongest of every square of the image, then the second ones, ..."""
+    square = (pixels // (width / _SQUARES_ACROSS)).astype(np.int64) @ (1, _SQUARES_ACROSS)
+    order = np.lexsort((-strength, square))
+    grouped = square[order]
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order)) - np.searchsorted(grouped, grouped)
+    return np.lexsort((-strength, rank))[:count]
+
+
+def _depth_at(pixels: NDArray[np.float32], depth_m: FloatImage) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Mean depth [N] of 3 x 3 pixels, and whether all of them are measured and on one surface."""
     height, width = depth_m.shape
     u, v = np.rint(pixels).astype(np.int64).T[:, :, None]

@@ -1,7 +1,8 @@
 """Are two keyframes that look alike views of one place, and what is the motion between them?
 
 Features that match by their looks must agree on one motion, which RANSAC finds and robust Gauss-Newton refines on
-their pixels and depths, each weighted by its noise in both views. All of the two depth images must agree on it too.
+their pixels and depths, each weighted by its noise in both views. What the two views show besides must not speak
+against it: all of the two depth images, and features that one has where the other one, on the same surface, has none.
 """
 
 from __future__ import annotations
@@ -13,21 +14,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.closures.depth_agreement import DepthGrid, agreement
+from tgslam.closures.depth_agreement import DepthGrid, agreement, compared
 from tgslam.closures.features import Features, matches
 from tgslam.closures.relative import Measurement, Quadratic, solve
 from tgslam.config.schema import LoopConfig
-from tgslam.geometry import transform_points
+from tgslam.geometry import inverse, transform_points
 from tgslam.types import Camera
 
 Vector = NDArray[np.float64]
 
-_RANSAC_ROUNDS = 300
+_RANSAC_ROUNDS = 150
 _CONFIDENCE = 0.999
 _FIRST_STEPS = 3  # before it is decided anew which features agree
 _ROBUST_SIGMAS = 3.0  # beyond which a feature counts less
 _INLIER_SIGMAS = 4.0  # of three coordinates
-_PLACES_ACROSS = 40  # the image: features in one of its squares are one
+_PLACES_ACROSS = 80  # the image: features in one of its squares are one
 
 
 @dataclass(frozen=True)
@@ -81,8 +82,10 @@ class Verification:
         if agree.mean() < config.min_inlier_share or self._places(points.seen_j[agree]) < config.min_inliers:
             return None
         measured = solve(partial(self._of_points, points[agree]), measured.T_ji, config)
+        if measured.rank < 6 or agree.sum() < config.min_seen_again * self._in_both(look_i, look_j, measured.T_ji):
+            return None
         agreeing, overlap = agreement(look_i.depth, look_j.depth, measured.T_ji, self._sigma)
-        if measured.rank < 6 or agreeing < config.min_depth_agreement or overlap < config.min_overlap:
+        if agreeing < config.min_depth_agreement or overlap < config.min_overlap:
             return None
         return Sameness(measured, self._places(points.seen_j[agree]))
 
@@ -111,7 +114,7 @@ class Verification:
         K = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
         found, rotation, shift, rows = cv2.solvePnPRansac(
             points.in_i, points.seen_j[:, :2], K, None, iterationsCount=_RANSAC_ROUNDS,
-            reprojectionError=self._config.inlier_px, confidence=_CONFIDENCE, flags=cv2.SOLVEPNP_SQPNP,
+            reprojectionError=self._config.inlier_px, confidence=_CONFIDENCE, flags=cv2.SOLVEPNP_AP3P,
         )  # fmt: skip
         T_ji, agree = np.eye(4), np.zeros(len(points.in_i), np.bool_)
         if found and rows is not None and np.isfinite(rotation).all() and np.isfinite(shift).all():
@@ -153,6 +156,13 @@ class Verification:
         limit = np.array([config.common_sigma_rad] * 3 + [config.common_sigma_m] * 3) ** -2.0
         share = np.linalg.solve(A + np.diag(limit), np.column_stack([A, b])) * limit[:, None]
         return Quadratic(share[:, :6], share[:, 6], float(squares.sum()), 3 * len(error))
+
+    def _in_both(self, look_i: Look, look_j: Look, T_ji: Vector) -> int:
+        """How many features of one view, the one that has more of them, are on surfaces that the other one sees."""
+        from_i, from_j = look_i.features.points(self._camera), look_j.features.points(self._camera)
+        ahead, _ = compared(from_i, T_ji, look_j.depth, self._sigma)
+        back, _ = compared(from_j, inverse(T_ji), look_i.depth, self._sigma)
+        return max(ahead, back)
 
     def _places(self, seen: Vector) -> int:
         """How many squares of the image hold any of the pixels [N, 3]."""

@@ -282,7 +282,7 @@ class LoopConfig:
     """Visual loop closures: keyframes that look the same, whatever the graph says of where they are."""
 
     enabled: bool = setting(False)  # not part of the method; off, what structure closures do is seen alone
-    features: int = setting(500, 50, 10_000)  # of a keyframe, at most
+    features: int = setting(400, 50, 10_000)  # of a keyframe, at most
     corner_contrast: int = setting(10, 1, 254)  # of FAST corners, steps of 1/255
     max_bits: int = setting(64, 0, 256)  # of 256 in which descriptors of one point differ
     ratio: float = setting(0.85, 0.1, 1.0)  # of that to the same for the next best point: more is ambiguous
@@ -291,6 +291,7 @@ class LoopConfig:
     # What makes two keyframes views of one place
     min_inliers: int = setting(25, 6, 10_000)  # points that agree on one motion, each at a place of its own
     min_inlier_share: float = setting(0.5, 0.0, 1.0)  # of the points that match by their looks
+    min_seen_again: float = setting(0.15, 0.0, 1.0)  # of the points that both views ought to see
     min_depth_agreement: float = setting(0.8, 0.0, 1.0)  # of depth that both views ought to see
     min_overlap: float = setting(0.2, 0.0, 1.0)  # of the images, where it agrees
     partner_gap: int = setting(6, 1, 1000)  # keyframes at most between an earlier one and a second that confirms it
