@@ -366,10 +366,11 @@ def test_the_information_is_how_the_cost_grows_with_the_pose():
     def cost(xi: np.ndarray) -> float:
         return reference.cost(settings, T_mw @ inverse(se3_exp(xi) @ result.T_cw), live, model)
 
+    information = CONFIG.correlated_px * result.information  # as if every pixel spoke for itself
     for way in np.eye(6)[[0, 2, 4, 5]]:
-        step = way / np.sqrt(way @ result.information @ way) * 12.0  # a small part of a sigma for each pixel
+        step = way / np.sqrt(way @ information @ way) * 12.0  # a small part of a sigma for each pixel
         growth = cost(step) + cost(-step) - 2 * cost(np.zeros(6))
-        assert growth == pytest.approx(step @ result.information @ step, rel=0.1)  # creases and borders: not quadratic
+        assert growth == pytest.approx(step @ information @ step, rel=0.1)  # creases and borders: not quadratic
     # The cost is too rough to tell one frame from another; the twin's matrix, carried over by differences, is not
     T_ml = T_mw @ inverse(result.T_cw)
     moves = [
@@ -380,7 +381,7 @@ def test_the_information_is_how_the_cost_grows_with_the_pose():
     expected = carry.T @ reference.normal_equations(settings, T_ml, live, model)["A"] @ carry
     scale = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(
-        result.information / np.outer(scale, scale), expected / np.outer(scale, scale), atol=3e-3
+        information / np.outer(scale, scale), expected / np.outer(scale, scale), atol=3e-3
     )
 
 
@@ -496,7 +497,7 @@ class FakeTracker:
     def __init__(self, good: list[float]) -> None:
         self.good, self.asked = good, []
 
-    def track(self, frame, gaussians, T_cw, exposure):
+    def track(self, frame, gaussians, T_cw, exposure, prior=None):
         self.asked.append(T_cw[0, 3])
         lost = T_cw[0, 3] not in self.good
         measures = {"start": float(T_cw[0, 3])}
@@ -551,7 +552,7 @@ def moved(seconds: float) -> np.ndarray:
 
 
 def test_without_a_past_nothing_moves():
-    motion = ConstantVelocity()
+    motion = ConstantVelocity(CONFIG)
     np.testing.assert_array_equal(motion.predict(5.0), np.eye(4))
     motion.update(5.0, START)
     np.testing.assert_allclose(motion.predict(9.0), START, atol=1e-12)
@@ -559,7 +560,7 @@ def test_without_a_past_nothing_moves():
 
 @pytest.mark.parametrize("times_s", [(0.0, 0.1, 0.2), (0.0, 0.03, 0.5), (7.0, 7.9, 7.95)])
 def test_a_steady_motion_is_foretold_at_any_time(times_s):
-    motion = ConstantVelocity()
+    motion = ConstantVelocity(CONFIG)
     for time_s in times_s[:2]:
         motion.update(time_s, moved(time_s))
     np.testing.assert_allclose(motion.predict(times_s[2]), moved(times_s[2]), atol=1e-9)
@@ -567,7 +568,7 @@ def test_a_steady_motion_is_foretold_at_any_time(times_s):
 
 
 def test_equal_or_earlier_timestamps_keep_the_velocity():
-    motion = ConstantVelocity()
+    motion = ConstantVelocity(CONFIG)
     motion.update(0.0, moved(0.0))
     motion.update(0.1, moved(0.1))
     for time_s in (0.1, 0.05):
@@ -575,8 +576,44 @@ def test_equal_or_earlier_timestamps_keep_the_velocity():
         np.testing.assert_allclose(motion.predict(time_s + 0.2), moved(0.2), atol=1e-9)
 
 
+def test_the_prediction_is_trusted_but_for_what_hands_do_and_less_without_a_velocity():
+    motion = ConstantVelocity(CONFIG)
+    assert not motion.information(3.0).any()
+    motion.update(3.0, START)
+    unknown = motion.information(3.1)
+    motion.update(3.1, moved(0.1))
+    for elapsed_s in (0.03, 0.1, 1.0):
+        sigmas = np.diag(motion.information(3.1 + elapsed_s)) ** -0.5
+        np.testing.assert_allclose(sigmas[:3], CONFIG.acceleration_rad * elapsed_s**2)
+        np.testing.assert_allclose(sigmas[3:], CONFIG.acceleration_m * elapsed_s**2)
+    assert (np.diag(unknown) < 0.5 * np.diag(motion.information(3.2))).all()
+    motion.slow_down()
+    np.testing.assert_allclose(motion.information(3.2), unknown, rtol=1e-9)
+    assert np.isfinite(motion.information(3.1)).all() and np.isfinite(motion.information(2.0)).all()
+
+
+def test_a_world_that_moves_takes_the_prediction_with_it_and_not_the_velocity():
+    motion, correction = ConstantVelocity(CONFIG), se3_exp([0.1, 0.2, -0.1, 0.3, 0.0, 0.4])
+    motion.move(correction)
+    motion.update(0.0, moved(0.0))
+    motion.update(0.1, moved(0.1))
+    motion.move(correction)
+    np.testing.assert_allclose(motion.predict(0.2), moved(0.2) @ inverse(correction), atol=1e-9)
+
+
+def test_a_prior_holds_the_directions_in_which_pixels_say_little_and_no_others():
+    """Before a blank wall: it tells distance and tilt, and nothing of the rest."""
+    scene = Planes((WALL,), contrast=0.0)
+    start, prior = se3_exp([0.0, 0.0, 0.0, 0.03, -0.02, 0.04]), np.diag(np.array([0.02] * 3 + [0.03] * 3) ** -2.0)
+    found = exact_tracker(scene).track(scene.frame(np.eye(4)), None, start, Exposure(), prior)
+    normal = np.array(WALL[0]) / np.linalg.norm(WALL[0])
+    shift = found.T_cw[:3, 3] - start[:3, 3]
+    assert abs(found.T_cw[:3, 3] @ normal) < 0.002  # the distance is the wall's
+    assert np.linalg.norm(shift - (shift @ normal) * normal) < 0.002  # along it the camera is where it was foretold
+
+
 def test_slowing_down_halves_the_motion_each_time():
-    motion = ConstantVelocity()
+    motion = ConstantVelocity(CONFIG)
     motion.update(0.0, moved(0.0))
     motion.update(1.0, moved(1.0))
     motion.slow_down()

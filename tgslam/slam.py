@@ -145,12 +145,13 @@ class Slam:
             self.structure_cue.reset(seen, keyframe.T_cw)
 
     def _close(self) -> None:
-        """Structure closures of the last keyframe: where they correct the graph, map and motion follow."""
-        if not self.closing or not self.mapper.planes:
+        """The last keyframe in the pose graph: where planes and closures correct it, map and motion follow."""
+        if not self.closing:
             return
         latest = len(self.mapper.keyframes) - 1
         with self._stage("graph"):
-            correction = self.closing.add(self.mapper.keyframes, self.mapper.planes.registry)
+            planes = self.mapper.planes.registry if self.mapper.planes else None
+            correction = self.closing.add(self.mapper.keyframes, planes)
         for earlier in correction.closures:
             self.mapper.viewpoints.link(earlier, latest)
         if correction.motions:
@@ -197,18 +198,19 @@ class Slam:
             stage_s=dict(self._stage_s),
             measures=dict(result.measures),
             message=result.message or cue,
+            closures=self.closing.closure_count if self.closing else None,
         )
 
 
 def _closing(camera: Camera, config: Config) -> GraphClosing | None:
     """Imported only where it is used: gtsam takes a while to load. Raises ConfigError for closures without planes."""
-    if not config.closures.enabled:
+    if not (config.closures.enabled or config.loops.enabled):
         return None
-    if not config.planes.enabled:
+    if config.closures.enabled and not config.planes.enabled:
         raise ConfigError("closures.enabled needs planes: set planes.enabled=true as well")
     from tgslam.closures.closing import GraphClosing
 
-    return GraphClosing(camera, config.loss.depth_sigma_per_m2, config.closures)
+    return GraphClosing(camera, config.loss.depth_sigma_per_m2, config.closures, config.loops)
 
 
 def _trajectory(timestamps_s: list[float], T_wc: list[NDArray[np.float64]]) -> Trajectory:

@@ -136,4 +136,5 @@ class FrameReport:
     gaussians: int  # in the map, after the frame
     stage_s: dict[str, float]  # seconds spent by stage: "track", "map", ...
     measures: dict[str, float]  # residuals, inlier ratio, condition number, gain, bias, iterations
-    message: str = ""  # why it was skipped or lost
+    message: str = ""  # why it was skipped or lost, or became a keyframe
+    closures: int | None = None  # edges of the pose graph besides odometry, after the frame; None = there is no graph

@@ -1,4 +1,4 @@
-"""Keeps the pose graph in step with the keyframes: their odometry and planes go in, corrected poses come out."""
+"""Keeps the pose graph in step with the keyframes: odometry, planes and closures go in, corrected poses come out."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam.closures.appearance import LoopSearch
 from tgslam.closures.icp import View
-from tgslam.closures.search import ClosureSearch
-from tgslam.config.schema import ClosureConfig
+from tgslam.closures.search import Closure, ClosureSearch
+from tgslam.config.schema import ClosureConfig, LoopConfig
 from tgslam.geometry import inverse
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.planes.estimate import PlaneEstimate
@@ -35,30 +36,37 @@ class GraphClosing:
     now against its estimate when the map last followed.
     """
 
-    def __init__(self, camera: Camera, depth_sigma_per_m2: float, config: ClosureConfig) -> None:
+    def __init__(self, camera: Camera, depth_sigma_per_m2: float, config: ClosureConfig, loops: LoopConfig) -> None:
         """depth_sigma_per_m2: the sensor's noise, sigma_z = this * z^2."""
         self._config = config
         self._graph = PoseGraph(config)
-        self._search = ClosureSearch(camera, depth_sigma_per_m2, config) if config.formulation != "landmarks" else None
+        self._landmarks = config.enabled and config.formulation != "closures"
+        by_planes = config.enabled and config.formulation != "landmarks"
+        self._search = ClosureSearch(camera, depth_sigma_per_m2, config) if by_planes else None
+        self._loops = LoopSearch(camera, depth_sigma_per_m2, loops) if loops.enabled else None
         self._applied: list[NDArray[np.float64]] = []  # T_cw of the graph that the map follows
         self._sighted: dict[int, set[int]] = {}  # PGI -> keyframes whose sightings are in the graph
 
     @property
     def closure_count(self) -> int:
-        """Structure closures in the graph."""
+        """Edges of the graph besides odometry."""
         return self._graph.closure_count
 
-    def add(self, keyframes: Sequence[Keyframe], planes: PlaneRegistry) -> Correction:
-        """Take in the last keyframe, mapped and with its planes observed. Raises GraphError without a solution."""
-        latest = len(keyframes) - 1
+    def add(self, keyframes: Sequence[Keyframe], planes: PlaneRegistry | None) -> Correction:
+        """Take in the last keyframe, mapped and, if there are planes, with them observed.
+
+        Raises GraphError without a solution.
+        """
         self._add_odometry(keyframes)
-        if self._config.formulation != "closures":
+        if self._landmarks and planes:
             self._add_sightings(planes)
-        estimate = self._graph.optimise()
-        closures = self._add_closures(keyframes, planes, estimate.T_cw) if latest else ()
-        if closures:
-            estimate = self._graph.optimise()
-        return Correction(self._motions(estimate.T_cw), closures)
+        T_cw = self._graph.optimise().T_cw
+        found = [*self._structure_closures(keyframes, planes, T_cw), *self._loop_closures(keyframes, T_cw)]
+        for closure in found:
+            self._graph.add_closure(closure.earlier, len(keyframes) - 1, closure.measured.motion)
+        if found:
+            T_cw = self._graph.optimise().T_cw
+        return Correction(self._motions(T_cw), tuple(closure.earlier for closure in found))
 
     def _add_odometry(self, keyframes: Sequence[Keyframe]) -> None:
         latest, T_cw = len(keyframes) - 1, keyframes[-1].T_cw
@@ -87,22 +95,27 @@ class GraphClosing:
                     self._graph.add_plane_observation(keyframe, plane_id, view)
             known.update(instance.keyframes)
 
-    def _add_closures(
-        self, keyframes: Sequence[Keyframe], planes: PlaneRegistry, T_cw: NDArray[np.float64]
-    ) -> tuple[int, ...]:
-        """Edges from the latest keyframe to earlier ones that see the same planes."""
+    def _structure_closures(
+        self, keyframes: Sequence[Keyframe], planes: PlaneRegistry | None, T_cw: NDArray[np.float64]
+    ) -> tuple[Closure, ...]:
+        """Of the latest keyframe with earlier ones that see the same planes."""
         latest = len(keyframes) - 1
-        if self._search is None or latest % self._config.interval:
+        if self._search is None or planes is None or latest == 0 or latest % self._config.interval:
             return ()
         sightings: dict[int, Mapping[int, PlaneEstimate]] = {k: planes.seen_from(k) for k in range(latest + 1)}
 
         def view(keyframe: int) -> View:
             return View(keyframes[keyframe].depth_m(), _resolved(keyframes[keyframe].plane_ids, planes))
 
-        found = self._search.find(sightings, dict(enumerate(T_cw)), self._graph.relative, view)
-        for closure in found.closures:
-            self._graph.add_closure(closure.earlier, latest, closure.measured.motion)
-        return tuple(closure.earlier for closure in found.closures)
+        return self._search.find(sightings, dict(enumerate(T_cw)), self._graph.relative, view).closures
+
+    def _loop_closures(self, keyframes: Sequence[Keyframe], T_cw: NDArray[np.float64]) -> tuple[Closure, ...]:
+        """Of the latest keyframe with earlier ones that look the same."""
+        if self._loops is None:
+            return ()
+        keyframe, latest = keyframes[-1], len(keyframes) - 1
+        poses = dict(enumerate(T_cw))
+        return self._loops.find(latest, keyframe.colour(), keyframe.depth_m(), poses, self._graph.relative).closures
 
     def _motions(self, T_cw: NDArray[np.float64]) -> dict[int, Matrix4]:
         """Of all keyframes once one of them has moved enough to matter."""

@@ -67,6 +67,7 @@ def counts(reports: Sequence[FrameReport]) -> dict[str, Any]:
         "tracked_fraction": used / len(reports) if reports else None,
         "keyframes": sum(report.is_keyframe for report in reports),
         "gaussians": reports[-1].gaussians if reports else 0,
+        "closures": reports[-1].closures if reports else None,
         "stage_s": dict(stage_s),
     }
 

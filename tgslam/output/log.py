@@ -66,9 +66,9 @@ def plain(value: Any) -> Any:
 def _report(path: Path, number: int, line: str) -> FrameReport:
     try:
         values = json.loads(line)
-        known = {field.name: values[field.name] for field in dataclasses.fields(FrameReport)}
+        known = {field.name: values[field.name] for field in dataclasses.fields(FrameReport) if field.name in values}
         known["status"] = FrameStatus(known["status"])
         known["timestamp_s"] = math.nan if known["timestamp_s"] is None else float(known["timestamp_s"])
+        return FrameReport(**known)
     except (ValueError, KeyError, TypeError) as error:
         raise OutputError(f"{path}:{number}: damaged: not a frame report") from error
-    return FrameReport(**known)

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from tgslam.config.schema import TrackingConfig
 from tgslam.geometry import inverse, se3_exp, se3_log
 
+_LEAST_S = 1.0 / 120.0  # between frames whose timestamps say less
+
 
 class ConstantVelocity:
     """Predicts T_cw by repeating the last motion, scaled by the time between frames."""
@@ -33,7 +35,7 @@ class ConstantVelocity:
         """
         if self._last is None:
             return np.zeros((6, 6))
-        elapsed_s = timestamp_s - self._last[0]
+        elapsed_s = max(timestamp_s - self._last[0], _LEAST_S)
         turn_rad = self._config.acceleration_rad * elapsed_s**2
         shift_m = self._config.acceleration_m * elapsed_s**2
         if not self._known:
