@@ -229,6 +229,24 @@ class TestVerification:
             error = se3_log(same.measured.T_ji @ inverse(truth.motion(0, k)))
             assert np.linalg.norm(error[:3]) < MAX_RAD and np.linalg.norm(error[3:]) < MAX_M
 
+    def test_surfaces_hold_what_few_features_leave(self) -> None:
+        """Wide apart, and with some of the features only."""
+        truth = walk("room", 4, 8)
+        first, last = look(truth.frames[0]), look(truth.frames[3])
+        verification = Verification(CAMERA, DEPTH_SIGMA_PER_M2, replace(CONFIG, min_seen_again=0.0))
+        same = verification.compare(first, last)
+        assert same is not None
+
+        def error(T_ji: np.ndarray) -> np.ndarray:
+            return se3_log(T_ji @ inverse(truth.motion(0, 3)))
+
+        astray = se3_exp([0.01, -0.01, 0.01, 0.02, -0.02, 0.02]) @ same.measured.T_ji
+        few = replace(same, measured=replace(same.measured, T_ji=astray), points=same.points[np.arange(8)])
+        for start in (same, few):
+            refined = verification.refined(start, first, last)
+            assert refined.rank == 6
+            assert np.linalg.norm(error(refined.T_ji)[:3]) < 0.005 and np.linalg.norm(error(refined.T_ji)[3:]) < 0.01
+
     def test_views_of_two_places(self) -> None:
         assert self.compared("desk", 4, 150) == [None] * 3
 

@@ -64,11 +64,12 @@ class LoopSearch:
         self._looks.append(look)
         if best is None:
             return Findings((), unconfirmed, gated=0)
+        measured = self._verification.refined(best.same, self._looks[best.order], look)
         T_ji, covariance = relative(best.keyframe, keyframe)
         drift = self._config.understated**2 * covariance
-        if not passes(best.same.measured, T_ji, drift, self._config.gate_probability):
+        if not passes(measured, T_ji, drift, self._config.gate_probability):
             return Findings((), unconfirmed, gated=1)
-        return Findings((Closure(best.keyframe, (), best.same.measured),), unconfirmed, gated=0)
+        return Findings((Closure(best.keyframe, (), measured),), unconfirmed, gated=0)
 
     def _alike(self, scores: Vector) -> list[int]:
         """The most alike of the earlier keyframes that are no neighbours, best first; of equal ones the oldest."""

@@ -11,7 +11,7 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-_DRAWS = 8
+_DRAWS = 4
 _BITS = 14  # of a word
 _SEED = 20240
 _WORDS = 1 << _BITS  # of a draw

@@ -3,6 +3,7 @@
 Features that match by their looks must agree on one motion, which RANSAC finds and robust Gauss-Newton refines on
 their pixels and depths, each weighted by its noise in both views. What the two views show besides must not speak
 against it: all of the two depth images, and features that one has where the other one, on the same surface, has none.
+Where features are few or close together the surfaces that both views show hold the motion better than they do.
 """
 
 from __future__ import annotations
@@ -14,11 +15,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam import closure_fit, runtime
 from tgslam.closures.depth_agreement import DepthGrid, agreement, compared
 from tgslam.closures.features import Features, matches
 from tgslam.closures.relative import Measurement, Quadratic, solve
 from tgslam.config.schema import LoopConfig
-from tgslam.geometry import inverse, transform_points
+from tgslam.geometry import adjoint, inverse, transform_points
 from tgslam.types import Camera
 
 Vector = NDArray[np.float64]
@@ -27,6 +29,8 @@ _RANSAC_ROUNDS = 150
 _CONFIDENCE = 0.999
 _FIRST_STEPS = 3  # before it is decided anew which features agree
 _ROBUST_SIGMAS = 3.0  # beyond which a feature counts less
+_SURFACE_STEPS = 4
+_MATCH_DISTANCE_M = 0.1  # of surfaces: those farther apart are different ones
 _INLIER_SIGMAS = 4.0  # of three coordinates
 _PLACES_ACROSS = 80  # the image: features in one of its squares are one
 
@@ -40,7 +44,7 @@ class Look:
 
 
 @dataclass(frozen=True)
-class _Points:
+class Points:
     """Features [N] that match, with their noise."""
 
     in_i: Vector  # [N, 3] m
@@ -48,16 +52,30 @@ class _Points:
     seen_j: Vector  # [N, 3] px, px, m
     variance_j: Vector  # [N, 3]
 
-    def __getitem__(self, rows: NDArray[np.generic]) -> _Points:
-        return _Points(self.in_i[rows], self.covariance_i[rows], self.seen_j[rows], self.variance_j[rows])
+    def __getitem__(self, rows: NDArray[np.generic]) -> Points:
+        return Points(self.in_i[rows], self.covariance_i[rows], self.seen_j[rows], self.variance_j[rows])
+
+
+@dataclass(frozen=True)
+class _Surfaces:
+    """A view's depth on the device."""
+
+    points: np.ndarray  # [N, 3] m, camera
+    depth_m: np.ndarray  # [h, w] m, 0 = none
+    camera: Camera
+
+    @classmethod
+    def of(cls, depth: DepthGrid) -> _Surfaces:
+        return cls(runtime.to_device(depth.points()), runtime.to_device(depth.depth_m), depth.camera)
 
 
 @dataclass(frozen=True)
 class Sameness:
     """A verified pair of keyframes."""
 
-    measured: Measurement  # in all six directions
-    inliers: int  # features that agree on it, at different places
+    measured: Measurement  # in all six directions, by features
+    inliers: int  # of them, at different places
+    points: Points  # those
 
 
 class Verification:
@@ -87,9 +105,27 @@ class Verification:
         agreeing, overlap = agreement(look_i.depth, look_j.depth, measured.T_ji, self._sigma)
         if agreeing < config.min_depth_agreement or overlap < config.min_overlap:
             return None
-        return Sameness(measured, self._places(points.seen_j[agree]))
+        return Sameness(measured, self._places(points.seen_j[agree]), points[agree])
 
-    def _points(self, in_i: Features, in_j: Features, pairs: NDArray[np.int64]) -> _Points:
+    def refined(self, same: Sameness, look_i: Look, look_j: Look) -> Measurement:
+        """With the distances between the two depth images' surfaces, in both directions, besides the features."""
+        views = _Surfaces.of(look_i.depth), _Surfaces.of(look_j.depth)
+        return solve(partial(self._of_all, same.points, *views), same.measured.T_ji, self._config, _SURFACE_STEPS)
+
+    def _of_all(self, points: Points, view_i: _Surfaces, view_j: _Surfaces, T_ji: Vector) -> Quadratic:
+        """Surfaces have an error in common as features do; either view's count half."""
+        forth, back = self._of_surfaces(view_j, view_i, inverse(T_ji)), self._of_surfaces(view_i, view_j, T_ji)
+        turned = -adjoint(inverse(T_ji))  # a perturbation of T_ji as one of T_ij
+        A, b = forth.A + turned.T @ back.A @ turned, forth.b + turned.T @ back.b
+        return self._of_points(points, T_ji) + self._limited(0.5 * A, 0.5 * b, 0.0, 0)
+
+    def _of_surfaces(self, moving: _Surfaces, still: _Surfaces, T: Vector) -> closure_fit.SurfaceDistances:
+        """In a left perturbation of the inverse of T, which takes `moving` to `still`."""
+        return closure_fit.surface_distances(
+            moving.points, T, still.depth_m, still.camera, self._sigma, self._config.model_sigma_m, _MATCH_DISTANCE_M
+        )
+
+    def _points(self, in_i: Features, in_j: Features, pairs: NDArray[np.int64]) -> Points:
         """A feature's noise is that of its pixel, which the level of the pyramid scales, and of its depth."""
         camera, (i, j) = self._camera, pairs.T
         points = in_i.points(camera)[i]
@@ -100,7 +136,7 @@ class Verification:
         for axis in range(2):
             covariance[:, axis, axis] += variance_i[:, axis] * along[axis] ** 2
         seen_j = np.column_stack([in_j.pixels, in_j.depth_m]).astype(np.float64)[j]
-        return _Points(points, covariance, seen_j, variance_j)
+        return Points(points, covariance, seen_j, variance_j)
 
     def _variance(self, features: Features) -> Vector:
         """[N, 3] px^2, px^2, m^2."""
@@ -108,7 +144,7 @@ class Verification:
         depth = (self._sigma * features.depth_m.astype(np.float64) ** 2) ** 2 + self._config.model_sigma_m**2
         return np.column_stack([pixel, pixel, depth])
 
-    def _sampled(self, points: _Points) -> tuple[Vector, NDArray[np.bool_]]:
+    def _sampled(self, points: Points) -> tuple[Vector, NDArray[np.bool_]]:
         """A motion [4, 4] that many points agree on, by their pixels, and which they are; RANSAC seeds itself."""
         camera = self._camera
         K = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
@@ -122,7 +158,7 @@ class Verification:
             agree[rows[:, 0]] = True
         return T_ji, agree
 
-    def _errors(self, points: _Points, T_ji: Vector) -> tuple[Vector, Vector, Vector]:
+    def _errors(self, points: Points, T_ji: Vector) -> tuple[Vector, Vector, Vector]:
         """Of (px, px, m) in j: [N, 3], their covariances [N, 3, 3] and derivatives [N, 3, 6] by a left perturbation."""
         camera = self._camera
         p = transform_points(T_ji, points.in_i)
@@ -140,22 +176,26 @@ class Verification:
         moved[:, [2, 0, 1], [1, 2, 0]] = -p
         return seen - points.seen_j, covariance, by_point @ moved
 
-    def _squares(self, points: _Points, T_ji: Vector) -> Vector:
+    def _squares(self, points: Points, T_ji: Vector) -> Vector:
         """[N] squared Mahalanobis distances."""
         error, covariance, _ = self._errors(points, T_ji)
         return np.sum(error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0], axis=1)
 
-    def _of_points(self, points: _Points, T_ji: Vector) -> Quadratic:
+    def _of_points(self, points: Points, T_ji: Vector) -> Quadratic:
         """What the points say near T_ji, with Cauchy weights, and no more than their common error leaves of it."""
         error, covariance, jacobian = self._errors(points, T_ji)
         white = np.linalg.solve(covariance, np.concatenate([jacobian, error[:, :, None]], axis=2))
         squares = np.sum(error * white[:, :, 6], axis=1)
         white = white / (1.0 + squares[:, None, None] / _ROBUST_SIGMAS**2)
         A, b = np.einsum("nki,nkj->ij", jacobian, white[:, :, :6]), np.einsum("nki,nk->i", jacobian, white[:, :, 6])
+        return self._limited(A, b, float(squares.sum()), 3 * len(error))
+
+    def _limited(self, A: Vector, b: Vector, value: float, count: int) -> Quadratic:
+        """Normal equations without the certainty that an error common to all of the residuals takes away."""
         config = self._config
         limit = np.array([config.common_sigma_rad] * 3 + [config.common_sigma_m] * 3) ** -2.0
         share = np.linalg.solve(A + np.diag(limit), np.column_stack([A, b])) * limit[:, None]
-        return Quadratic(share[:, :6], share[:, 6], float(squares.sum()), 3 * len(error))
+        return Quadratic(share[:, :6], share[:, 6], value, count)
 
     def _in_both(self, look_i: Look, look_j: Look, T_ji: Vector) -> int:
         """How many features of one view, the one that has more of them, are on surfaces that the other one sees."""

@@ -293,7 +293,7 @@ class LoopConfig:
     min_inlier_share: float = setting(0.5, 0.0, 1.0)  # of the points that match by their looks
     min_seen_again: float = setting(0.15, 0.0, 1.0)  # of the points that both views ought to see
     min_depth_agreement: float = setting(0.8, 0.0, 1.0)  # of depth that both views ought to see
-    min_overlap: float = setting(0.2, 0.0, 1.0)  # of the images, where it agrees
+    min_overlap: float = setting(0.2, 0.01, 1.0)  # of the images, where it agrees
     partner_gap: int = setting(6, 1, 1000)  # keyframes at most between an earlier one and a second that confirms it
     partner_rad: float = setting(0.03, 1e-4, 3.15)  # by which the two may disagree
     partner_m: float = setting(0.06, 1e-4, 10.0)
@@ -302,8 +302,8 @@ class LoopConfig:
     # The motion
     inlier_px: float = setting(3.0, 0.1, 100.0)  # at the finest level of the images, to begin with
     pixel_sigma: float = setting(0.8, 0.01, 100.0)  # of a feature, likewise
-    model_sigma_m: float = setting(0.005, 1e-5, 1.0)  # of a feature's depth, beyond the sensor's noise
-    common_sigma_rad: float = setting(0.002, 1e-6, 1.0)  # what all features have in error together
+    model_sigma_m: float = setting(0.005, 1e-5, 1.0)  # of depth, beyond the sensor's noise
+    common_sigma_rad: float = setting(0.002, 1e-6, 1.0)  # what all features, or all of depth, have in error together
     common_sigma_m: float = setting(0.005, 1e-6, 1.0)
     known_rad: float = setting(0.02, 1e-4, 10.0)  # a motion known no better than this in any direction is no closure
     known_m: float = setting(0.05, 1e-4, 10.0)
