@@ -317,6 +317,7 @@ class _Incremental:
     def __init__(self, threshold: float) -> None:
         params = gtsam.ISAM2Params()
         params.relinearizeSkip = 1
+        params.setFactorization("QR")  # the squares of Cholesky's are too much for what is known a little in places
         params.setRelinearizeThreshold(threshold)
         self._isam = gtsam.ISAM2(params)
 
@@ -343,6 +344,7 @@ class _Batch:
         self._values.insert(values)
         params = gtsam.LevenbergMarquardtParams()
         params.setMaxIterations(_MAX_ITERATIONS)
+        params.setLinearSolverType("MULTIFRONTAL_QR")
         self._values = gtsam.LevenbergMarquardtOptimizer(self._graph, self._values, params).optimize()
         return gtsam.Values(self._values)
 

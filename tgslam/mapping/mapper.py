@@ -185,7 +185,8 @@ class Mapper:
     def _too_coarse(self, keyframe: Keyframe, surface: Surface, planes: PlanarPixels | None) -> NDArray[np.bool_]:
         """[N] Gaussians on the keyframe's surface that are much larger in it than it would seed there today.
 
-        They were seeded from afar. Only those well inside the image go, so that the keyframe fills all that they leave.
+        They were seeded from afar or, on floors and walls, at a grazing angle. Only those well inside the image go, so
+        that the keyframe fills all that they leave.
         """
         colour, depth_m = keyframe.colour(), keyframe.depth_m()
         if planes:
@@ -195,8 +196,8 @@ class Mapper:
         wanted_px = np.zeros(len(surface.z))
         smallest = self.seeding.smallest_cell_px
         wanted_px[surface.inside] = sizes[surface.v // smallest, surface.u // smallest]
-        in_plane = np.sort(np.exp(self.gaussians.host("log_scale")), axis=-1)[:, 1]
-        std_px = in_plane * self.camera.fx / surface.z
+        std_px = np.zeros(len(surface.z))
+        std_px[surface.inside] = surface.longest_px(self.gaussians)
         margin = 2.0 * std_px[surface.inside]
         whole = np.zeros(len(surface.z), bool)
         whole[surface.inside] = (np.minimum(surface.u, self.camera.width - 1 - surface.u) > margin) & (

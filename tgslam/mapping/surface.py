@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.gaussian_map import GaussianMap
-from tgslam.geometry import transform_points
+from tgslam.geometry import matrix_from_quat_wxyz, transform_points
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.types import Camera
 
@@ -25,6 +25,20 @@ class Projection:
         u, v = np.rint(self.exact_u), np.rint(self.exact_v)
         self.inside = (x[:, 2] > _NEAR_M) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)  # [N]
         self.u, self.v = u[self.inside].astype(int), v[self.inside].astype(int)  # [inside] px
+        self._camera, self._T_cw = camera, T_cw
+
+    def longest_px(self, gaussians: GaussianMap) -> NDArray[np.float64]:
+        """[inside] px, standard deviation along the axis that is longest in the image."""
+        rows = np.flatnonzero(self.inside)
+        turns = self._T_cw[:3, :3] @ matrix_from_quat_wxyz(gaussians.host("quat_wxyz")[rows])
+        axes = turns * np.exp(gaussians.host("log_scale")[rows].astype(np.float64))[:, None]  # [inside, 3, 3] columns
+        z = self.z[rows, None]
+        x = (self.exact_u[rows, None] - self._camera.cx) / self._camera.fx
+        y = (self.exact_v[rows, None] - self._camera.cy) / self._camera.fy
+        across = self._camera.fx / z * (axes[:, 0] - x * axes[:, 2])
+        down = self._camera.fy / z * (axes[:, 1] - y * axes[:, 2])
+        longest: NDArray[np.float64] = np.hypot(across, down).max(axis=1)
+        return longest
 
 
 class Surface(Projection):

@@ -1,0 +1,167 @@
+"""The pose graph in step with keyframes: drift that planes take back, and what the map is told of it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tests.plane_worlds import Box, odometry, position_errors_m, walking
+from tgslam.closures.closing import GraphClosing
+from tgslam.config.schema import ClosureConfig, Config, LoopConfig, PlanesConfig
+from tgslam.errors import ConfigError
+from tgslam.geometry import inverse, orthonormalized
+from tgslam.slam import Slam
+from tgslam.types import Camera
+
+CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+SIZE_M = (2.0, 2.4, 16.0)
+CONFIG = ClosureConfig(
+    enabled=True,
+    icp_rounds=0,
+    odometry_sigma_rad=0.003,
+    odometry_sigma_m=0.005,
+    least_shift_m=1e-6,
+    least_turn_rad=1e-6,
+)
+
+
+class Planes:
+    """Stands in for the registry: instances with the views that keyframes have had of them so far."""
+
+    def __init__(self) -> None:
+        self.views: dict[int, dict] = {}
+        self.renamed: dict[int, int] = {}
+        self.split: set[int] = set()
+
+    def resolve(self, plane_id: int) -> int:
+        return self.renamed.get(plane_id, plane_id)
+
+    def seen_from(self, keyframe: int) -> dict:
+        return {self.resolve(i): view for i, view in self.views.get(keyframe, {}).items()}
+
+    @property
+    def instances(self) -> dict:
+        ids = sorted({self.resolve(i) for seen in self.views.values() for i in seen})
+        return {
+            i: SimpleNamespace(
+                keyframes=[k for k in self.views if i in self.seen_from(k)],
+                view=lambda k, i=i: self.seen_from(k).get(i),
+                split_from=self if i in self.split else None,
+            )
+            for i in ids
+        }
+
+
+class Walk:
+    """A drifting walk along a corridor whose keyframes come one by one."""
+
+    def __init__(self, seed: int, count: int = 40, noise: float = 1.0) -> None:
+        rng = np.random.default_rng(seed)
+        self.truth = walking(SIZE_M, count)
+        self.box, self.steps = Box(SIZE_M), odometry(self.truth, rng, noise)
+        self.seen = [self.box.views(T_cw, rng, noise) for T_cw in self.truth]
+        self.keyframes: list[SimpleNamespace] = []
+        self.planes = Planes()
+
+    def add(self, closing: GraphClosing) -> None:
+        """The next keyframe, as the map would follow."""
+        k = len(self.keyframes)
+        T_cw = self.steps[k - 1].T_ji @ self.keyframes[-1].T_cw if k else self.truth[0]
+        information = self.steps[k - 1].information if k else np.eye(6)
+        ids = np.full((CAMERA.height, CAMERA.width), -1, np.int16)
+        depth_m = np.zeros(ids.shape, np.float32)
+        self.keyframes.append(
+            SimpleNamespace(T_cw=T_cw, information=information, plane_ids=ids, depth_m=lambda: depth_m)
+        )
+        self.planes.views[k] = self.seen[k]
+        for number, motion in closing.add(self.keyframes, self.planes).motions.items():
+            self.keyframes[number].T_cw = orthonormalized(self.keyframes[number].T_cw @ inverse(motion))
+
+    def error_m(self) -> float:
+        errors = position_errors_m(np.stack([k.T_cw for k in self.keyframes]), self.truth)
+        return float(np.sqrt(np.mean(errors**2)))
+
+
+def walked(config: ClosureConfig, seed: int, **settings: float) -> Walk:
+    walk, closing = Walk(seed, **settings), GraphClosing(CAMERA, 0.0015, config, LoopConfig())
+    for _ in walk.truth:
+        walk.add(closing)
+    return walk
+
+
+@pytest.mark.parametrize("formulation", ["closures", "landmarks", "both"])
+def test_planes_take_back_most_of_the_drift(formulation: str) -> None:
+    before, after = [], []
+    for seed in range(3):
+        config = ClosureConfig(**{**vars(CONFIG), "formulation": formulation})
+        before.append(
+            walked(ClosureConfig(**{**vars(config), "formulation": "closures", "interval": 1000}), seed).error_m()
+        )
+        after.append(walked(config, seed).error_m())
+    assert np.mean(after) < 0.5 * np.mean(before)
+    assert all(a < 1.1 * b for a, b in zip(after, before, strict=True))
+
+
+def test_where_everything_is_right_nothing_moves() -> None:
+    walk = walked(ClosureConfig(**{**vars(CONFIG), "least_shift_m": 0.001, "least_turn_rad": 0.001}), 0, noise=0.0)
+    expected = Walk(0, noise=0.0)
+    for k, keyframe in enumerate(walk.keyframes):
+        np.testing.assert_allclose(keyframe.T_cw, expected.truth[k], atol=2e-3)
+
+
+def test_small_corrections_wait_until_they_add_up() -> None:
+    walk = Walk(1)
+    closing = GraphClosing(
+        CAMERA, 0.0015, ClosureConfig(**{**vars(CONFIG), "least_shift_m": 0.02, "least_turn_rad": 0.02}), LoopConfig()
+    )
+    moved = []
+    for _ in walk.truth:
+        before = [k.T_cw.copy() for k in walk.keyframes]
+        walk.add(closing)
+        shifts = [
+            np.linalg.norm(inverse(k.T_cw)[:3, 3] - inverse(T)[:3, 3])
+            for k, T in zip(walk.keyframes, before, strict=False)
+        ]
+        moved.append(max(shifts, default=0.0))
+    assert 0 < sum(m > 0 for m in moved) < len(moved) / 2
+
+
+def test_what_refinement_changes_between_corrections_is_kept() -> None:
+    walk, closing = Walk(2), GraphClosing(CAMERA, 0.0015, CONFIG, LoopConfig())
+    for _ in range(10):
+        walk.add(closing)
+    nudged = walk.keyframes[4].T_cw.copy()
+    nudged[0, 3] += 0.01
+    untouched, walk.keyframes[4].T_cw = walk.keyframes[4].T_cw, nudged
+    walk.add(closing)
+    moved = walk.keyframes[4].T_cw - untouched
+    assert moved[0, 3] == pytest.approx(0.01, abs=0.005)
+
+
+def test_planes_that_merge_are_one_landmark_from_then_on() -> None:
+    walk, closing = Walk(3), GraphClosing(CAMERA, 0.0015, CONFIG, LoopConfig())
+    first, other = sorted({i for seen in walk.seen for i in seen})[:2]
+    for k, seen in enumerate(walk.seen):
+        if k < 20 and first in seen:
+            seen[77] = seen.pop(first)  # known under another id at first
+    for _ in range(25):
+        walk.add(closing)
+    walk.planes.renamed[77] = first
+    for _ in range(15):
+        walk.add(closing)
+    assert (
+        walk.error_m()
+        < 0.7 * walked(ClosureConfig(**{**vars(CONFIG), "formulation": "closures", "interval": 1000}), 3).error_m()
+    )
+    assert closing.closure_count == 0
+    assert other != first
+
+
+def test_closures_without_planes_are_refused_with_the_way_out() -> None:
+    with pytest.raises(ConfigError, match=r"closures\.enabled.*planes\.enabled=true"):
+        Slam(CAMERA, Config(closures=ClosureConfig(enabled=True)))
+    assert Slam(CAMERA, Config(closures=ClosureConfig(enabled=True), planes=PlanesConfig(enabled=True))).closing
+    assert Slam(CAMERA, Config(loops=LoopConfig(enabled=True))).closing
+    assert Slam(CAMERA, Config()).closing is None
