@@ -46,6 +46,7 @@ class _Edge:
     i: int
     j: int
     motion: RelativePose
+    closure: bool  # not odometry
     robust: bool
 
 
@@ -78,7 +79,7 @@ class PoseGraph:
     @property
     def closure_count(self) -> int:
         """Edges other than odometry."""
-        return sum(edge.robust for edge in self._edges)
+        return sum(edge.closure for edge in self._edges)
 
     def add_first(self, keyframe: int, T_cw: Vector) -> None:
         """The keyframe that holds the graph: it stays at its pose [4, 4]. Raises GraphError if there is one already."""
@@ -96,18 +97,19 @@ class PoseGraph:
         an unknown previous keyframe, or for one that is no motion.
         """
         start = self._pose_of(previous)
-        self._add(_Edge(previous, keyframe, motion, robust=False))
+        self._add(_Edge(previous, keyframe, motion, closure=False, robust=False))
         self._insert(_pose(keyframe), start.compose(gtsam.Pose3(inverse(motion.T_ji))))
         self._keyframes.append(keyframe)
 
-    def add_closure(self, i: int, j: int, motion: RelativePose) -> None:
+    def add_closure(self, i: int, j: int, motion: RelativePose, *, robust: bool = True) -> None:
         """A motion from keyframe i to j measured otherwise; its information may be singular.
 
-        Raises GraphError for an unknown keyframe, or for one that is no motion.
+        robust: it may be wrong, and then gives way. What is certain must not: against the drift of a long way round it
+        would look like an outlier. Raises GraphError for an unknown keyframe, or for one that is no motion.
         """
         for keyframe in (i, j):
             self._pose_of(keyframe)
-        self._add(_Edge(i, j, motion, robust=True))
+        self._add(_Edge(i, j, motion, closure=True, robust=robust))
 
     def add_plane_observation(self, keyframe: int, plane_id: int, plane: PlaneEstimate) -> None:
         """A keyframe sees a plane; `plane` is that view's own, in its camera's frame.
@@ -231,7 +233,7 @@ class PoseGraph:
 
     def _edge_factor(self, edge: _Edge) -> gtsam.BetweenFactorPose3:
         motion, config = edge.motion, self._config
-        if not edge.robust:
+        if not edge.closure:
             motion = motion.widened(config.odometry_sigma_rad, config.odometry_sigma_m)
             motion = RelativePose(motion.T_ji, motion.information + _LOOSE)
         noise = gtsam.noiseModel.Gaussian.SqrtInformation(_root(motion.information), False)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tgslam import runtime
 from tgslam.config.schema import Config
 from tgslam.depth import measured_share, without_flying_pixels
-from tgslam.errors import ConfigError, FrameError
+from tgslam.errors import ConfigError, FrameError, GraphError
 from tgslam.geometry import inverse, orthonormalized
 from tgslam.keyframes import KeyframeSelector
 from tgslam.mapping.keyframe import Keyframe
@@ -59,13 +59,14 @@ class Slam:
         self.exposure = Exposure()
         self._posed: list[_Posed] = []
         self._stage_s: dict[str, float] = {}
+        self._remarks: list[str] = []  # on the present frame
 
     def process_frame(self, frame: Frame) -> FrameReport:
         """Estimate the frame's pose and, if it shows something new, map it. Frames come in order of time.
 
         Raises FrameError, with nothing changed, for a frame with next to no depth or of another size than the camera's.
         """
-        self._stage_s = {}
+        self._stage_s, self._remarks = {}, []
         with self._stage("prepare"):
             frame = self._prepared(frame)
         if not self.mapper.keyframes:
@@ -149,9 +150,15 @@ class Slam:
         if not self.closing:
             return
         latest = len(self.mapper.keyframes) - 1
-        with self._stage("graph"):
-            planes = self.mapper.planes.registry if self.mapper.planes else None
-            correction = self.closing.add(self.mapper.keyframes, planes)
+        planes = self.mapper.planes.registry if self.mapper.planes else None
+        try:
+            with self._stage("graph"):
+                correction = self.closing.add(self.mapper.keyframes, planes)
+        except GraphError as error:  # a map that is not corrected is better than none
+            self._remarks.append(str(error))
+            return
+        if correction.closures:
+            self._remarks.append(f"closures with keyframes {', '.join(map(str, correction.closures))}")
         for earlier in correction.closures:
             self.mapper.viewpoints.link(earlier, latest)
         if correction.motions:
@@ -197,7 +204,7 @@ class Slam:
             gaussians=self.mapper.gaussians.count,
             stage_s=dict(self._stage_s),
             measures=dict(result.measures),
-            message=result.message or cue,
+            message="; ".join([result.message or cue, *self._remarks]),
             closures=self.closing.closure_count if self.closing else None,
         )
 

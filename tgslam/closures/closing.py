@@ -61,9 +61,10 @@ class GraphClosing:
         if self._landmarks and planes:
             self._add_sightings(planes)
         T_cw = self._graph.optimise().T_cw
-        found = [*self._structure_closures(keyframes, planes, T_cw), *self._loop_closures(keyframes, T_cw)]
-        for closure in found:
-            self._graph.add_closure(closure.earlier, len(keyframes) - 1, closure.measured.motion)
+        by_planes, by_looks = self._structure_closures(keyframes, planes, T_cw), self._loop_closures(keyframes, T_cw)
+        for closure, robust in [(c, True) for c in by_planes] + [(c, False) for c in by_looks]:
+            self._graph.add_closure(closure.earlier, len(keyframes) - 1, closure.measured.motion, robust=robust)
+        found = (*by_planes, *by_looks)
         if found:
             T_cw = self._graph.optimise().T_cw
         return Correction(self._motions(T_cw), tuple(closure.earlier for closure in found))
