@@ -38,7 +38,7 @@ PADDED_SUMS = PACKED_SUMS * LANES
     CY,
     GAIN,
     BIAS,
-    DEPTH_SIGMA,  # sigma_z = this * z^2
+    DEPTH_SIGMA,  # sigma_z = this * z^2 + SURFACE_SIGMA
     MAX_DISTANCE_SIGMAS,  # depth residuals beyond are no match
     CHARBONNIER_DEPTH,  # epsilon in sigmas
     GATE_DEPTH_BOOST,
@@ -47,10 +47,11 @@ PADDED_SUMS = PACKED_SUMS * LANES
     WEIGHT_DEPTH,
     WEIGHT_COLOUR,
     WEIGHT_GRADIENT,
+    SURFACE_SIGMA,  # m
     GATE_LOW,  # G_min of Eq. 11, 1/px
     GATE_INVERSE_RANGE,  # 1 / (G_max - G_min + epsilon)
     POSE,
-) = range(18)
+) = range(19)
 SETTINGS = POSE + 12
 
 # What a live pixel holds: m, intensity, its gradient and that one's length (G of Eq. 10) in 1/px
@@ -210,7 +211,7 @@ def add_residuals(
     gate = gate_at(settings, strength)
     candidate = seen * indicator(filled(z, 0.0), model_depth)
     # depth: e is the length of the residual, whose sign is the distance's
-    sigma = settings[DEPTH_SIGMA] * depth * depth
+    sigma = settings[DEPTH_SIGMA] * depth * depth + settings[SURFACE_SIGMA]
     has_normal = indicator(filled(z, 0.5), nx * nx + ny * ny + nz * nz)
     length = ti.sqrt(ray_x * ray_x + ray_y * ray_y + 1.0)
     cosine = larger((0.0 - (nx * ray_x + ny * ray_y + nz)) / length, filled(length, _MIN_COSINE))

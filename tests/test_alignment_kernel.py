@@ -142,6 +142,7 @@ def test_sums_match_the_twin(size, seed):
         {"weight_depth": 0.0, "weight_colour": 0.0, "weight_gradient": 2.0},
         {"charbonnier_depth": 0.2, "sigma_gradient": 0.005, "sigma_colour": 0.01},
         {"max_distance_sigmas": 2.0},
+        {"surface_sigma": 0.004},
     ],
 )
 def test_each_setting_is_honoured(changes):

@@ -26,6 +26,7 @@ class Settings:
     weight_depth: float = 1.0
     weight_colour: float = 0.1
     weight_gradient: float = 0.1
+    surface_sigma: float = 0.0
 
 
 @dataclass
@@ -93,7 +94,7 @@ def pixel(s, T_ml, live, model, u, v):
         return None
     n = model["normal"][vn, un]
     distance, cosine = n @ (x - back_project(s, un, vn, zm)), max(-n @ ray / np.linalg.norm(ray), MIN_COSINE)
-    sigma = s.depth_sigma * z**2
+    sigma = s.depth_sigma * z**2 + s.surface_sigma
     along = abs(distance) / cosine if n.any() else abs(x[2] - zm)
     if along >= s.max_distance_sigmas * sigma:
         return Pixel(matched=False)

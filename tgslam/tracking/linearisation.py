@@ -80,6 +80,7 @@ class Lineariser:
             alignment.CX: camera.cx,
             alignment.CY: camera.cy,
             alignment.DEPTH_SIGMA: loss.depth_sigma_per_m2,
+            alignment.SURFACE_SIGMA: config.surface_sigma_m,
             alignment.MAX_DISTANCE_SIGMAS: config.max_distance_sigmas,
             alignment.CHARBONNIER_DEPTH: loss.charbonnier_depth_sigmas,
             alignment.GATE_DEPTH_BOOST: loss.gate_depth_boost,
