@@ -89,7 +89,7 @@ class TrackingConfig:
     weight_gradient: float = setting(0.3, 0.0, 100.0)
     correlated_px: float = setting(100.0, 1.0, 1e6)  # neighbouring pixels err alike: so many inform like one
     # What hands do within a frame, where pixels do not say: the last velocity, but for these standard deviations
-    acceleration_m: float = setting(5.0, 0.01, 1e4)  # m/s^2
+    acceleration_m: float = setting(2.0, 0.01, 1e4)  # m/s^2
     acceleration_rad: float = setting(20.0, 0.01, 1e4)  # rad/s^2
     speed_m: float = setting(1.0, 0.001, 1e3)  # m/s, while no velocity is known
     speed_rad: float = setting(2.0, 0.001, 1e3)  # rad/s
@@ -253,8 +253,8 @@ class ClosureConfig:
     odometry_sigma_rad: float = setting(0.0002, 1e-7, 1.0)
     odometry_sigma_m: float = setting(0.0006, 1e-7, 1.0)
     # The map follows when a keyframe has moved or turned by so much
-    least_shift_m: float = setting(0.001, 0.0, 1.0)
-    least_turn_rad: float = setting(0.0005, 0.0, 1.0)
+    least_shift_m: float = setting(0.003, 0.0, 1.0)
+    least_turn_rad: float = setting(0.001, 0.0, 1.0)
     robust: str = setting("cauchy", choices=("none", "huber", "cauchy", "dcs"))  # noise of closures and planes
     robust_sigmas: float = setting(3.0, 0.1, 1000.0)  # beyond which an error counts less
     # A landmark's views count as this much less certain: where the surface strays from its plane, they all err alike

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _MIN_COSINE = 0.1  # a surface more grazing than this says nothing of the depth beside
 _MAX_SLANT = 0.1  # nor one whose depth changes by more within a block
-_NOTICED_M = 0.002  # by which keyframes have moved against each other, for the map between them to be refined
+_NOTICED_M = 0.005  # by which keyframes have moved against each other, for the map between them to be refined
 _MIN_VIEWS = 3  # a Gaussian is judged invisible only after so many views
 
 
