@@ -296,3 +296,22 @@ def test_the_icl_clip(icl_clip: Path) -> None:
     assert result.matched >= 29  # the published ground truth lacks one row
     assert result.rmse_m < 0.003
     assert held_out_psnr(played, source) > 28
+
+
+@pytest.mark.parametrize("formulation", ["landmarks", "closures"])
+def test_planes_in_the_pose_graph_hold_a_camera_that_turns(formulation: str) -> None:
+    source = built_in("turn", 330)
+    frames = read(source, range(0, 90, 3))
+    structure = ["planes.enabled=true", "closures.enabled=true", f"closures.formulation={formulation}"]
+    closed = play(source, frames, load(None, structure))
+    assert closed.all_tracked()
+    assert closed.reports[-1].closures is not None and (closed.reports[-1].closures > 0) == (formulation == "closures")
+    assert ate_cm(closed.slam.trajectory(), source) < 0.4
+
+
+def test_a_run_with_every_kind_of_closure_repeats_bit_for_bit(room: RgbdSource, room_frames: list[Frame]) -> None:
+    everything = ["planes.enabled=true", "closures.enabled=true", "closures.formulation=both", "loops.enabled=true"]
+    first, second = (play(room, room_frames[:24], load(None, everything)).slam for _ in range(2))
+    np.testing.assert_array_equal(first.trajectory().T_wc, second.trajectory().T_wc)
+    for field in fields(Gaussians):
+        np.testing.assert_array_equal(getattr(first.gaussians(), field.name), getattr(second.gaussians(), field.name))
