@@ -38,7 +38,7 @@ PADDED_SUMS = PACKED_SUMS * LANES
     CY,
     GAIN,
     BIAS,
-    DEPTH_SIGMA,  # sigma_z = this * z^2 + SURFACE_SIGMA
+    DEPTH_SIGMA,  # the sensor's sigma_z = this * z^2
     MAX_DISTANCE_SIGMAS,  # depth residuals beyond are no match
     CHARBONNIER_DEPTH,  # epsilon in sigmas
     GATE_DEPTH_BOOST,
@@ -47,7 +47,7 @@ PADDED_SUMS = PACKED_SUMS * LANES
     WEIGHT_DEPTH,
     WEIGHT_COLOUR,
     WEIGHT_GRADIENT,
-    SURFACE_SIGMA,  # m
+    SURFACE_SIGMA,  # m, the map's own error, added to the sensor's in the weights
     GATE_LOW,  # G_min of Eq. 11, 1/px
     GATE_INVERSE_RANGE,  # 1 / (G_max - G_min + epsilon)
     POSE,
@@ -211,7 +211,7 @@ def add_residuals(
     gate = gate_at(settings, strength)
     candidate = seen * indicator(filled(z, 0.0), model_depth)
     # depth: e is the length of the residual, whose sign is the distance's
-    sigma = settings[DEPTH_SIGMA] * depth * depth + settings[SURFACE_SIGMA]
+    sensor = settings[DEPTH_SIGMA] * depth * depth
     has_normal = indicator(filled(z, 0.5), nx * nx + ny * ny + nz * nz)
     length = ti.sqrt(ray_x * ray_x + ray_y * ray_y + 1.0)
     cosine = larger((0.0 - (nx * ray_x + ny * ray_y + nz)) / length, filled(length, _MIN_COSINE))
@@ -220,11 +220,11 @@ def add_residuals(
     distance = nx * (x - model_x) + ny * (y - model_y) + nz * (z - model_depth)
     across = magnitude(distance) / cosine
     along = has_normal * across + (1.0 - has_normal) * magnitude(z - model_depth)
-    matched = candidate * indicator(along, settings[MAX_DISTANCE_SIGMAS] * sigma)
+    matched = candidate * indicator(along, settings[MAX_DISTANCE_SIGMAS] * sensor)
     on_surface = matched * has_normal
-    inv_sigma = 1.0 / (sigma * cosine)
-    e = magnitude(distance) * inv_sigma
-    scaled = e * (1.0 / settings[CHARBONNIER_DEPTH])
+    e = magnitude(distance) / (sensor * cosine)  # by which the pose is judged; the map's own error has no part in it
+    inv_sigma = 1.0 / ((sensor + settings[SURFACE_SIGMA]) * cosine)
+    scaled = magnitude(distance) * inv_sigma * (1.0 / settings[CHARBONNIER_DEPTH])
     weight = settings[WEIGHT_DEPTH] * on_surface * (1.0 + settings[GATE_DEPTH_BOOST] * gate)
     weight *= irls_weight(scaled * scaled) * inv_sigma * inv_sigma
     weight_x, weight_y, weight_z, weight_e = weight * nx, weight * ny, weight * nz, weight * distance

@@ -91,7 +91,7 @@ def room_run(room: SyntheticSource, room_frames: list[Frame]) -> Played:
 @pytest.mark.parametrize(("scene", "frames", "psnr_db"), [("blank", 720, 34.5), ("loop", 420, 32.0)])
 def test_built_in_scenes(scene: str, frames: int, psnr_db: float) -> None:
     source = built_in(scene, frames)
-    played = play(source, read(source, range(40)))
+    played = play(source, read(source, range(50)))
     played.slam.finish()
     assert played.all_tracked()
     assert ate_cm(played.slam.trajectory(), source) < 0.45

@@ -57,6 +57,7 @@ class Pixel:
     gradient: Term | None = None
     live: float = 0.0
     model: float = 0.0
+    sensor_sigmas: float = 0.0  # of the depth residual, where there is one
 
 
 def bilinear(image, u, v):
@@ -94,9 +95,9 @@ def pixel(s, T_ml, live, model, u, v):
         return None
     n = model["normal"][vn, un]
     distance, cosine = n @ (x - back_project(s, un, vn, zm)), max(-n @ ray / np.linalg.norm(ray), MIN_COSINE)
-    sigma = s.depth_sigma * z**2 + s.surface_sigma
+    sensor = s.depth_sigma * z**2
     along = abs(distance) / cosine if n.any() else abs(x[2] - zm)
-    if along >= s.max_distance_sigmas * sigma:
+    if along >= s.max_distance_sigmas * sensor:
         return Pixel(matched=False)
     moves = np.hstack([-hat(x), np.eye(3)])  # d x / d xi
     shifts = np.array([[s.fx, 0, -s.fx * x[0] / x[2]], [0, s.fy, -s.fy * x[1] / x[2]]]) / x[2] @ moves
@@ -104,7 +105,8 @@ def pixel(s, T_ml, live, model, u, v):
     gate = live["gate"][v, u]
     if n.any():
         weight = s.weight_depth * (1 + s.gate_depth_boost * gate)
-        scale = 1 / (sigma * cosine)
+        scale = 1 / ((sensor + s.surface_sigma) * cosine)
+        result.sensor_sigmas = abs(distance) / (sensor * cosine)
         result.depth = Term(np.array([distance * scale]), scale * (n @ moves)[None], weight, s.charbonnier_depth)
     slope = np.array([bilinear(model[name], um, vm) for name in ("gx", "gy")])
     e = np.array([result.model - s.gain * result.live - s.bias])
@@ -140,7 +142,7 @@ def normal_equations(s, T_ml, live, model):
     for t in terms(matched):
         A += t.weight * t.robust * t.jacobian.T @ t.jacobian
         b += t.weight * t.robust * t.jacobian.T @ t.e
-    depth = np.array([abs(p.depth.e[0]) for p in matched if p.depth is not None])
+    depth = np.array([p.sensor_sigmas for p in matched if p.depth is not None])
     w, m, n = np.array([(p.colour.robust, p.live, p.model) for p in matched]).reshape(-1, 3).T
     return {
         "A": A,

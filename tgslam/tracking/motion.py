@@ -19,6 +19,7 @@ class ConstantVelocity:
         self._last: tuple[float, NDArray[np.float64]] | None = None
         self._velocity = np.zeros(6)  # rad/s, m/s
         self._known = False  # whether that was seen
+        self._lost = False  # whether the last pose is only where the camera coasted to
 
     def predict(self, timestamp_s: float) -> NDArray[np.float64]:
         """T_cw [4, 4] at that time."""
@@ -28,12 +29,12 @@ class ConstantVelocity:
         return se3_exp(self._velocity * (timestamp_s - last_s)) @ T_cw
 
     def information(self, timestamp_s: float) -> NDArray[np.float64]:
-        """[6, 6] of the prediction's left perturbation: none before the first pose.
+        """[6, 6] of the prediction's left perturbation: none before the first pose, and none while the camera is lost.
 
         Cameras in hands and on robots do not jump: as much as they accelerate between frames is what is uncertain, and
         all of the velocity while there is none.
         """
-        if self._last is None:
+        if self._last is None or self._lost:
             return np.zeros((6, 6))
         elapsed_s = max(timestamp_s - self._last[0], _LEAST_S)
         turn_rad = self._config.acceleration_rad * elapsed_s**2
@@ -47,8 +48,8 @@ class ConstantVelocity:
         """Take in a tracked pose."""
         if self._last is not None and timestamp_s > self._last[0]:
             self._velocity = se3_log(T_cw @ inverse(self._last[1])) / (timestamp_s - self._last[0])
-            self._known = True
-        self._last = (timestamp_s, T_cw)
+            self._known = not self._lost
+        self._last, self._lost = (timestamp_s, T_cw), False
 
     def move(self, motion: NDArray[np.float64]) -> None:
         """The world around the camera has moved, p_w <- motion p_w [4, 4]; its velocity is as it was."""
@@ -58,4 +59,4 @@ class ConstantVelocity:
     def slow_down(self) -> None:
         """Believe in half the velocity: where tracking is lost, the last one soon tells nothing."""
         self._velocity = self._velocity / 2.0
-        self._known = False
+        self._lost = True
