@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from tests.plane_views import segment_of
+from tests.plane_worlds import shifted
 from tgslam.geometry import inverse, se3_exp
 from tgslam.planes.estimate import (
     PlaneEstimate,
@@ -36,15 +37,6 @@ def random_plane(rng: np.random.Generator, sigma: float = 0.01) -> PlaneEstimate
     )
 
 
-def perturbed(plane: PlaneEstimate, error: np.ndarray) -> PlaneEstimate:
-    """With errors (alpha, beta, delta) of its own parameters."""
-    first, second = plane.axes
-    normal = plane.normal - error[0] * second + error[1] * first
-    normal = normal / np.linalg.norm(normal)
-    centroid = plane.centroid + error[2] * plane.normal
-    return PlaneEstimate(normal, np.asarray(-normal @ centroid), centroid, tangent_axes(normal), plane.covariance)
-
-
 def random_pose(rng: np.random.Generator) -> np.ndarray:
     return se3_exp(rng.uniform(-2, 2, 6))
 
@@ -66,7 +58,7 @@ def test_a_transform_and_back_is_the_same_plane(seed: int) -> None:
 def test_deviation_does_not_depend_on_the_frame(seed: int) -> None:
     rng = np.random.default_rng(seed)
     plane = random_plane(rng)
-    other = perturbed(random_plane(rng), np.zeros(3)) if seed % 2 else perturbed(plane, 0.02 * rng.standard_normal(3))
+    other = shifted(random_plane(rng), np.zeros(3)) if seed % 2 else shifted(plane, 0.02 * rng.standard_normal(3))
     moved = random_pose(rng)
     assert_allclose(
         deviation_sigmas(plane.transformed(moved), other.transformed(moved)),
@@ -79,7 +71,7 @@ def test_deviation_is_in_standard_deviations() -> None:
     rng = np.random.default_rng(1)
     truth = random_plane(rng, sigma=0.003)
     root = np.linalg.cholesky(truth.covariance)
-    drawn = stacked([perturbed(truth, root @ rng.standard_normal(3)) for _ in range(4000)])
+    drawn = stacked([shifted(truth, root @ rng.standard_normal(3)) for _ in range(4000)])
     drawn = PlaneEstimate(
         drawn.normal, drawn.offset_m, drawn.centroid, np.broadcast_to(truth.axes, (4000, 2, 3)), drawn.covariance
     )
@@ -133,7 +125,7 @@ def test_fusion_is_consistent_and_beats_its_parts() -> None:
 def test_one_wrong_view_hardly_moves_the_fused_plane() -> None:
     rng = np.random.default_rng(4)
     plane = random_plane(rng, sigma=0.005)
-    wrong = perturbed(plane, np.array([0.0, 0.0, 0.2]))
+    wrong = shifted(plane, np.array([0.0, 0.0, 0.2]))
     fused = fuse(stacked([plane] * 6 + [wrong]))
     assert abs(fused.heights_m(plane.centroid)) < 0.01
 

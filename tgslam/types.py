@@ -38,6 +38,11 @@ class Camera:
             )
         return camera
 
+    def rays(self) -> NDArray[np.float64]:
+        """[H, W, 3] what each pixel looks along, in the camera's frame, with z = 1."""
+        v, u = np.mgrid[: self.height, : self.width]
+        return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones(u.shape)], -1)
+
 
 @dataclass(frozen=True)
 class Frame:

@@ -44,8 +44,7 @@ class PlanarMapping:
         self.camera, self.config, self.sigma_per_m2 = camera, config, sigma_per_m2
         self.registry = PlaneRegistry(config, sigma_per_m2)
         self._T_cw: list[NDArray[np.float64]] = []  # of each keyframe, as the PGIs know it
-        v, u = np.mgrid[: camera.height, : camera.width]
-        self._rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], -1)
+        self._rays = camera.rays()
 
     @property
     def instances(self) -> dict[int, PlanarInstance]:

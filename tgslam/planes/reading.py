@@ -28,8 +28,7 @@ class PlaneReader:
         """depth_sigma_per_m2: the sensor's noise, sigma_z = this * z^2, m."""
         self.config, self.sigma_per_m2 = config, depth_sigma_per_m2
         self.planes = sorted(planes, key=lambda plane: plane.id)
-        v, u = np.mgrid[: camera.height, : camera.width]
-        self._rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], -1)
+        self._rays = camera.rays()
 
     def read(self, images: RenderImages, T_cw: Matrix4) -> NDArray[np.int32]:
         """The plane [H, W] that each pixel shows, -1 = none. images: a rendering from T_cw with its embedding."""
