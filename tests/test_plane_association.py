@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from tests.plane_views import Rectangle, Stage, looking
-from tests.test_plane_estimate import perturbed, random_plane, random_pose
+from tests.plane_worlds import shifted
+from tests.test_plane_estimate import random_plane, random_pose
 from tgslam.config.schema import PlanesConfig
 from tgslam.geometry import inverse, so3_exp, transform_points
 from tgslam.planes.association import Agreement, assign, gate, matching_cost, overlap
@@ -34,7 +35,7 @@ def plane_at(normal: tuple[float, float, float], point: tuple[float, float, floa
 def test_the_gate_does_not_depend_on_the_worlds_origin(seed: int) -> None:
     rng = np.random.default_rng(seed)
     plane = random_plane(rng)
-    other = perturbed(plane, 0.03 * rng.standard_normal(3))
+    other = shifted(plane, 0.03 * rng.standard_normal(3))
     camera, moved = rng.uniform(-3, 3, 3), random_pose(rng)
     here = gate(plane, other, camera, CONFIG)
     there = gate(plane.transformed(moved), other.transformed(moved), transform_points(moved, camera), CONFIG)
