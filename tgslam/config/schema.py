@@ -124,7 +124,7 @@ class SeedingConfig:
     cells_across: int = setting(
         80, 1, 10_000
     )  # the image, about so many of the largest cells: doublings of the smallest
-    plane_cells_across: int = setting(40, 1, 10_000)  # likewise on one plane (PGI)
+    plane_cells_across: int = setting(80, 1, 10_000)  # likewise on one plane (PGI)
     plain_colour_std: float = setting(0.015, 0.0, 1.0)  # a cell whose channels vary less has no texture
     plane_colour_std: float = setting(0.015, 0.0, 1.0)  # likewise for a cell on one plane, but for a linear trend
     planar_sigmas: float = setting(2.0, 0.0, 100.0)  # a cell whose plane residual is less, in sensor sigmas, is flat
