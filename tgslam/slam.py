@@ -17,6 +17,7 @@ from tgslam.depth import measured_share, without_flying_pixels
 from tgslam.errors import ConfigError, FrameError, GraphError
 from tgslam.geometry import inverse, orthonormalized
 from tgslam.keyframes import KeyframeSelector
+from tgslam.mapping.brightness import relative_gain
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.mapper import Mapper
 from tgslam.planes.cue import StructureCue
@@ -47,6 +48,7 @@ class Slam:
 
     def __init__(self, camera: Camera, config: Config) -> None:
         self.camera, self.sigma_per_m2 = camera, config.loss.depth_sigma_per_m2
+        self._matches_brightness = config.tracking.exposure == "gain"
         self.tracker = make_tracker(camera, config.tracking, config.loss)
         self.motion = ConstantVelocity(config.tracking)
         self.selector = KeyframeSelector(config.keyframes)
@@ -135,6 +137,8 @@ class Slam:
 
     def _map(self, frame: Frame, result: TrackingResult) -> None:
         keyframe = Keyframe.from_frame(frame, result.T_cw, result.exposure, result.information)
+        if self._matches_brightness and self.mapper.keyframes:
+            self._match_brightness(keyframe)
         with self._stage("map"):
             self.mapper.add_keyframe(keyframe)
         self._close()
@@ -144,6 +148,12 @@ class Slam:
         if self.mapper.planes:
             seen = self.mapper.planes.seen_from(len(self.mapper.keyframes) - 1)
             self.structure_cue.reset(seen, keyframe.T_cw)
+
+    def _match_brightness(self, keyframe: Keyframe) -> None:
+        previous = self.mapper.keyframes[-1]
+        gain = relative_gain(keyframe, previous, self.camera)
+        if gain is not None:
+            keyframe.exposure = Exposure(gain * previous.exposure.gain)
 
     def _close(self) -> None:
         """The last keyframe in the pose graph: where planes and closures correct it, map and motion follow."""
