@@ -109,6 +109,36 @@ def test_holes_of_a_plane_are_filled_closely(kind):
     assert np.median(error) < 0.01 and error.max() < 0.06
 
 
+@pytest.mark.parametrize("width_px", [1, 3, 4])
+def test_a_hole_at_an_edge_is_guessed_on_one_of_the_two_surfaces(width_px):
+    exact_m = np.where(np.arange(64) < 32, np.float32(1.0), np.float32(3.0)) * np.ones((48, 1), np.float32)
+    depth_m = exact_m.copy()
+    depth_m[:, 31 : 31 + width_px] = 0.0
+    guess = depth.filled(depth_m)
+    assert set(np.unique(guess)) == {1.0, 3.0}
+    assert (np.diff(guess, axis=1) >= 0).all()
+
+
+def test_a_wide_hole_in_a_slope_is_bridged():
+    exact_m = plane()
+    depth_m = exact_m.copy()
+    depth_m[:, 20:44] = 0.0
+    guess = depth.filled(depth_m)
+    constant = depth_m.ravel()[depth.nearest_measured(depth_m)]
+    assert abs(guess - exact_m).mean() < 0.5 * abs(constant - exact_m).mean()
+
+
+def test_the_nearest_measurement_is_the_nearest_one():
+    depth_m = np.float32(ragged(20, 30, seed=5))
+    depth_m[4:15, 8:22] = 0.0
+    rows, columns = np.nonzero(depth_m)
+    found_rows, found_columns = np.divmod(depth.nearest_measured(depth_m), 30)
+    assert (depth_m[found_rows, found_columns] > 0).all()
+    v, u = np.mgrid[:20, :30]
+    least = np.hypot(v[..., None] - rows, u[..., None] - columns).min(-1)
+    assert (np.hypot(v - found_rows, u - found_columns) <= 1.05 * least + 1e-9).all()
+
+
 def test_guesses_stay_between_the_nearest_and_the_farthest_measurement():
     depth_m = np.float32(ragged(45, 33, seed=4))
     filled = depth.filled(depth_m)

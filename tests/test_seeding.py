@@ -187,6 +187,33 @@ def test_the_smallest_cells_that_are_wanted_by_half_are_covered_and_no_others(fr
                 assert (count[cell] == (2 * (wanted[cell] & valid).sum() >= valid.sum())).all()
 
 
+@pytest.mark.parametrize("nearer_columns", [11, 12])
+def test_no_cell_hangs_between_two_surfaces(nearer_columns: int) -> None:
+    """Whether the edge runs between cells or through them: of a cell that shows both surfaces one is taken."""
+    depth_m = np.where(np.arange(CAMERA.width) < nearer_columns, 1.0, 3.0) * np.ones((CAMERA.height, 1))
+    colour = np.where(depth_m[..., None] < 2.0, 0.2, 0.8) * np.ones(3)
+    cells = quadtree(colour, depth_m, everywhere(depth_m), CONFIG, SIGMA)
+    np.testing.assert_allclose(np.minimum(abs(cells.depth_m - 1.0), abs(cells.depth_m - 3.0)), 0.0, atol=1e-6)
+    np.testing.assert_allclose(cells.colour[:, 0], np.where(cells.depth_m < 2.0, 0.2, 0.8), atol=1e-6)
+    assert (times_covered(cells, depth_m.shape) == 1).all()
+
+
+def test_a_cell_shows_what_most_of_its_pixels_show() -> None:
+    """Three of four on the farther surface, then all but one without depth, then a slope that is no step."""
+    depth_m = np.full((CAMERA.height, CAMERA.width), 2.0)
+    depth_m[0, :4] = [1.0, 2.0, 2.0, 2.0]
+    depth_m[0:2, 4:6] = [[0.0, 0.0], [0.0, 1.5]]
+    depth_m[0:2, 8:10] = [[2.0, 2.02], [2.0, 2.02]]
+    rng = np.random.default_rng(3)
+    colour = rng.random((*depth_m.shape, 3))  # the smallest cells everywhere
+    cells = quadtree(colour, depth_m, everywhere(depth_m), CONFIG, SIGMA)
+    at = {(int(u) // 2, int(v) // 2): i for i, (u, v) in enumerate(zip(cells.u, cells.v, strict=True))}
+    np.testing.assert_allclose(
+        cells.depth_m[[at[0, 0], at[2, 0], at[4, 0]]], [2.0, 1.5, 2.0 / (1.0 - 0.005 / 1.01)], rtol=1e-4
+    )
+    np.testing.assert_allclose(cells.colour[at[0, 0]], colour[[0, 1, 1], [1, 0, 1]].mean(0))
+
+
 def test_nothing_wanted_or_no_depth_gives_no_cell() -> None:
     depth_m = plane_depth(0.0)
     assert len(quadtree(grey(depth_m), depth_m, ~everywhere(depth_m), CONFIG, SIGMA).u) == 0

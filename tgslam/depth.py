@@ -14,6 +14,7 @@ from tgslam.kernels.image import SPLIT
 _TOLERANCE_SIGMAS = 4.2  # three sigma of a difference of two measurements
 _STEEPEST = 5.7  # tangent of 80 degrees
 _MIN_NEIGHBOURS = 4
+_NARROW_PX = 2  # a hole's pixels that are no farther from a measurement are at an edge
 
 
 def without_flying_pixels(depth_m: np.ndarray, sigma_per_m2: float, focal_px: float) -> np.ndarray:
@@ -35,8 +36,26 @@ def measured_share(depth_m: np.ndarray) -> float:
     return int(runtime.to_host(counts).sum()) / (height * width)
 
 
+def nearest_measured(depth_m: NDArray[np.float32]) -> NDArray[np.int64]:
+    """The measured pixel nearest to each pixel [H, W], as an index into the flat image; itself where it is measured.
+
+    depth_m: [H, W], 0 = none, with at least one measurement.
+    """
+    valid = depth_m > 0
+    regions = cv2.distanceTransformWithLabels(
+        (~valid).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )[1]
+    pixels = np.zeros(regions.max() + 1, np.int64)
+    pixels[regions[valid]] = np.flatnonzero(valid)
+    return pixels[regions]
+
+
 def filled(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Guess the depth of holes: inverse depth, in which planes are affine, interpolated from coarser and coarser means.
+    """Guess the depth of holes: near measurements that of the nearest one, farther off a smooth mean of those around.
+
+    Narrow holes lie at the edges of things. Whatever is there is one of the surfaces around; a mean of them would hang
+    in the air between. Wide ones are mostly surfaces that return no light, and the mean continues them: it is of
+    inverse depth, in which planes are affine, interpolated from coarser and coarser means.
 
     depth_m: [H, W], 0 = none. Measurements stay as they are; an image without any comes back as it is.
     """
@@ -44,8 +63,9 @@ def filled(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
     if valid.all() or not valid.any():
         return depth_m
     inverse = np.where(valid, 1.0 / np.where(valid, depth_m, 1.0), 0.0).astype(np.float32)
-    guess = _push_pull(inverse, valid.astype(np.float32))
-    return np.where(valid, depth_m, 1.0 / np.maximum(guess, 1e-3)).astype(np.float32)
+    guess = 1.0 / np.maximum(_push_pull(inverse, valid.astype(np.float32)), 1e-3)
+    near = cv2.dilate(valid.astype(np.uint8), np.ones((2 * _NARROW_PX + 1, 2 * _NARROW_PX + 1), np.uint8)) > 0
+    return np.where(near, depth_m.ravel()[nearest_measured(depth_m)], guess).astype(np.float32)
 
 
 def _push_pull(value: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:

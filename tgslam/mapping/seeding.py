@@ -19,11 +19,13 @@ from tgslam.planes import palette
 from tgslam.types import Camera, Gaussians
 
 _MIN_COSINE = 0.25  # foreshortening is compensated up to here: beyond, a cell's Gaussian would become a needle
+_STEP = 0.03  # share of the depth by which measurements of two surfaces are apart, if also by more than noise
+_STEP_SIGMAS = 4.2  # three sigma of a difference
 
 
 @dataclass(frozen=True)
 class Cells:
-    """Quadtree leaves of a frame: a square of `size_px` pixels each, with the mean of its valid pixels."""
+    """Quadtree leaves of a frame: a square of `size_px` pixels each, with the mean of its pixels on one surface."""
 
     u: NDArray[np.float64]  # [N] px, centre
     v: NDArray[np.float64]  # [N] px
@@ -133,7 +135,7 @@ def quadtree(
             use = open_cells & mostly & (on_plane | ((whole[level] > 0) & (needed == count)))
         else:
             use = open_cells & mostly
-        found.append(_means(use, depth, rgb, size))
+        found.append(_means(use, depth, rgb, size, None if level else sigma_per_m2))  # larger ones are planar
         if level:
             crumbs = on_plane & ~mostly if level == 1 else np.zeros(use.shape, bool)
             open_cells = np.repeat(np.repeat(open_cells & ~use & ~crumbs, 2, 0), 2, 1)
@@ -173,23 +175,44 @@ def _block_sums(image: NDArray[Any], size: int) -> NDArray[np.int32]:
 
 
 def _means(
-    use: NDArray[np.bool_], depth: NDArray[np.floating], rgb: NDArray[np.floating], size: int
+    use: NDArray[np.bool_],
+    depth: NDArray[np.floating],
+    rgb: NDArray[np.floating],
+    size: int,
+    sigma_per_m2: float | None,
 ) -> tuple[NDArray[np.float64], ...]:
-    """The columns of `Cells` for the blocks [rows, columns] in `use`, from their pixels with depth."""
+    """The columns of `Cells` for the blocks [rows, columns] in `use`, from their pixels with depth.
+
+    sigma_per_m2: the sensor's noise, by which to tell pixels on one surface from others; None = all are on one.
+    """
     row, column = np.nonzero(use)
     within_y, within_x = np.divmod(np.arange(size * size), size)
     at = row[:, None] * size + within_y, column[:, None] * size + within_x
     z, colours = depth[at].astype(np.float64), rgb[at].astype(np.float64)
-    valid = z > 0
-    weight = valid / valid.sum(-1, keepdims=True)
-    inverse_z = weight / np.where(valid, z, 1.0)  # a plane's mean depth is that of the centre
+    inverse_z = 1.0 / np.where(z > 0, z, np.inf)
+    alike = inverse_z > 0 if sigma_per_m2 is None else _on_one_surface(inverse_z, sigma_per_m2)
+    weight = alike / alike.sum(-1, keepdims=True)
     return (
         column * size + weight @ within_x,
         row * size + weight @ within_y,
         np.full(len(row), float(size)),
-        1.0 / inverse_z.sum(-1),
+        1.0 / (weight * inverse_z).sum(-1),  # a plane's mean depth is that of the centre
         np.einsum("np,npc->nc", weight, colours),
     )
+
+
+def _on_one_surface(inverse_z: NDArray[np.float64], sigma_per_m2: float) -> NDArray[np.bool_]:
+    """Which pixels [N, P] of a cell show the surface that most of them show, the nearer one of two that are even.
+
+    The mean of two surfaces would hang in the air between them. inverse_z: [N, P] 1/m, 0 = no depth, at least one > 0 a
+    cell; its noise is the same at every depth, sigma_per_m2.
+    """
+    ordered = np.sort(inverse_z, -1)  # no depth first, then from far to near
+    known = (inverse_z > 0).sum(-1)
+    median = np.take_along_axis(ordered, (inverse_z.shape[1] - known + known // 2)[:, None], -1)
+    tolerance = np.maximum(_STEP * median, _STEP_SIGMAS * sigma_per_m2)
+    alike: NDArray[np.bool_] = (inverse_z > 0) & (np.abs(inverse_z - median) <= tolerance)
+    return alike
 
 
 def seed(
