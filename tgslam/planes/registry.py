@@ -135,6 +135,8 @@ class PlaneRegistry:
                     found = PlanarInstance(matching.world(segment), self._config)
                     corrected |= self._part(segment, found, matching)
                 self._give(matching, segment, found, keyframe)
+        for pair in matching.steps():
+            self._joining.part(*pair)
         return corrected | self._divide(matching)
 
     def _give(self, matching: ViewMatching, segment: int, instance: PlanarInstance, keyframe: int) -> None:
