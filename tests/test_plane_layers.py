@@ -99,3 +99,18 @@ def test_bordering_labels_are_listed_in_both_orders() -> None:
     labels = np.array([[0, 0, 1], [-1, 2, 1]], np.int32)
     assert bordering(labels).tolist() == [[0, 1], [0, 2], [1, 0], [1, 2], [2, 0], [2, 1]]
     assert len(bordering(np.full((2, 2), -1, np.int32))) == 0
+
+
+def test_a_boards_extent_is_not_worn_away_by_the_wall_beside_it() -> None:
+    registry = PlaneRegistry(CONFIG, DEPTH_SIGMA_PER_M2)
+    for keyframe in range(12):
+        depth_m, labels = measured([WALL, BOARD], ALONG[4], keyframe)
+        view = seen(depth_m)
+        found = registry.observe(view, depth_m, CAMERA, ALONG[4], keyframe)
+    board = registry.instances[int(found.ids[of_board(view, labels)])]
+    wall = registry.instances[int(found.ids[0])]
+    in_view = Rectangle((0.1, 1.985, 0.6), BOARD.along, BOARD.across, (2.0, 0.08))
+    x, z = np.meshgrid(np.linspace(-0.9, 0.9, 37), [-0.01, 0.01])
+    places = np.array(in_view.centre) + np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
+    assert np.mean(board.support.holds(board.support.cells_of(places))) > 0.95
+    assert np.mean(wall.support.holds(wall.support.cells_of(places))) < 0.3
