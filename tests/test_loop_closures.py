@@ -365,7 +365,8 @@ class TestSearch:
             if k == 0:
                 graph.add_first(0, odometry[0])
             else:
-                graph.add_keyframe(k, k - 1, RelativePose(odometry[k] @ inverse(odometry[k - 1]), information))
+                motion = RelativePose(odometry[k] @ inverse(odometry[k - 1]), information)
+                graph.add_keyframe(k, {k - 1: motion})
             estimate = graph.optimise()
             T_cw = dict(zip(estimate.keyframes.tolist(), estimate.T_cw, strict=True))
             for closure in search.find(k, frame.colour, frame.depth_m, T_cw, graph.relative).closures:

@@ -160,6 +160,22 @@ def test_holes_of_the_depth_image_are_mapped_at_a_guess(source: SyntheticSource)
     assert np.median(np.abs(rendering.depth_m - frame.depth_m)[hole] / frame.depth_m[hole]) < 0.1
 
 
+def test_a_guess_does_not_hang_before_a_camera_that_goes_on(source: SyntheticSource) -> None:
+    """What is out of the sensor's range is mapped at the range's end; from nearer, the next guess is farther."""
+    mapper, frame = make_mapper(source, iterations=0), source.clean(0)
+    columns = np.abs(np.arange(source.camera.width) - source.camera.cx)
+    wall_m = np.broadcast_to(1.0 / np.maximum(columns / source.camera.fx, 0.2), frame.depth_m.shape)  # at x = +-1 m
+    depth_m = np.where(wall_m < 4.5, wall_m, 0.0).astype(np.float32)
+    nearest_m = []
+    for ahead_m in (0.0, 1.0, 2.0, 3.0):
+        forward = se3_exp([0.0, 0.0, 0.0, 0.0, 0.0, -ahead_m])
+        mapper.add_keyframe(keyframe(source, replace(frame, depth_m=depth_m), forward))
+        in_hole = mapper.guessed & (np.abs(mapper.gaussians.host("mean")[:, :2]) < 0.3).all(axis=1)
+        assert in_hole.any()
+        nearest_m.append(mapper.gaussians.host("mean")[in_hole, 2].min() - ahead_m)
+    assert min(nearest_m) > 0.75 * nearest_m[0]
+
+
 def test_a_static_scene_seen_for_long_does_not_fill_up(source: SyntheticSource) -> None:
     mapper = make_mapper(source, iterations=8)
     exact, (colour, geometry) = source.clean(0), source._exposed(0)
@@ -437,11 +453,12 @@ def test_the_size_in_the_image_is_that_of_the_longest_axis(source: SyntheticSour
     }  # fmt: skip
     rows = {name: np.array(value, np.float32) for name, value in one.items()}
     mapper.gaussians.append(Gaussians(**rows, plane_id=np.full(2, -1, np.int32), birth_keyframe=np.zeros(2, np.int32)))
-    ahead = Projection(mapper.gaussians, source.camera, T_cw).longest_px(mapper.gaussians)
+    rows = np.arange(2)
+    ahead = Projection(mapper.gaussians, source.camera, T_cw).axes_px(mapper.gaussians, rows).max(axis=1)
     fx = source.camera.fx
     np.testing.assert_allclose(ahead, [0.01 * fx / 2, 0.25 * 0.3 * fx / 2], rtol=1e-3)
     aside = se3_exp([0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0])
     aside[:3, 3] = np.array([0.0, 0.0, 3.0]) - aside[:3, :3] @ [0.0, 0.0, 2.0]
-    assert Projection(mapper.gaussians, source.camera, aside).longest_px(mapper.gaussians)[0] == pytest.approx(
+    assert Projection(mapper.gaussians, source.camera, aside).axes_px(mapper.gaussians, rows)[0].max() == pytest.approx(
         0.3 * fx / 3, rel=0.01
     )

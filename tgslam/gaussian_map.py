@@ -81,8 +81,11 @@ class GaussianMap:
 
     def gaussians(self) -> Gaussians:
         """A copy on the host."""
-        names = (*PARAMETERS, *_INT_FIELDS)
-        return Gaussians(**{name: runtime.to_host(getattr(self, name))[: self.count].copy() for name in names})
+        return self.rows(np.arange(self.count))
+
+    def rows(self, numbers: NDArray[np.integer]) -> Gaussians:
+        """A copy of some rows on the host."""
+        return Gaussians(**{name: self.host(name)[numbers] for name in (*PARAMETERS, *_INT_FIELDS)})
 
     def host(self, name: str) -> np.ndarray:
         """The rows in use of one parameter on the host: a view on the CPU, a copy under CUDA."""

@@ -90,16 +90,21 @@ class PoseGraph:
         self._insert(_pose(keyframe), gtsam.Pose3(inverse(T_cw)))
         self._keyframes.append(keyframe)
 
-    def add_keyframe(self, keyframe: int, previous: int, motion: RelativePose) -> None:
-        """A keyframe and its odometry, the motion to it from a previous one.
+    def add_keyframe(self, keyframe: int, odometry: Mapping[int, RelativePose]) -> None:
+        """A keyframe and its odometry: the motion to it from one or more earlier ones, the first of which places it.
 
-        The motion's information is tracking's own; what its residuals do not show is added here. Raises GraphError for
-        an unknown previous keyframe, or for one that is no motion.
+        Raises GraphError without odometry, for an unknown earlier keyframe, or for one that is no motion.
         """
-        start = self._pose_of(previous)
-        self._add(_Edge(previous, keyframe, motion, closure=False, robust=False))
-        self._insert(_pose(keyframe), start.compose(gtsam.Pose3(inverse(motion.T_ji))))
+        if not odometry:
+            raise GraphError(f"keyframe {keyframe} has no odometry")
+        starts = [self._pose_of(earlier) for earlier in odometry]
+        edges = [_Edge(earlier, keyframe, motion, closure=False, robust=False) for earlier, motion in odometry.items()]
+        for edge in edges:
+            _check(edge)
+        self._insert(_pose(keyframe), starts[0].compose(gtsam.Pose3(inverse(edges[0].motion.T_ji))))
         self._keyframes.append(keyframe)
+        for edge in edges:
+            self._add(edge)
 
     def add_closure(self, i: int, j: int, motion: RelativePose, *, robust: bool = True) -> None:
         """A motion from keyframe i to j measured otherwise; its information may be singular.
@@ -232,11 +237,9 @@ class PoseGraph:
         return gtsam.PriorFactorPose3(_pose(keyframe), gtsam.Pose3(inverse(T_cw)), noise)
 
     def _edge_factor(self, edge: _Edge) -> gtsam.BetweenFactorPose3:
-        motion, config = edge.motion, self._config
-        if not edge.closure:
-            motion = motion.widened(config.odometry_sigma_rad, config.odometry_sigma_m)
-            motion = RelativePose(motion.T_ji, motion.information + _LOOSE)
-        noise = gtsam.noiseModel.Gaussian.SqrtInformation(_root(motion.information), False)
+        motion = edge.motion
+        information = motion.information if edge.closure else motion.information + _LOOSE
+        noise = gtsam.noiseModel.Gaussian.SqrtInformation(_root(information), False)
         return gtsam.BetweenFactorPose3(
             _pose(edge.i),
             _pose(edge.j),

@@ -74,7 +74,8 @@ def _measure_here(size: Size, config: ClosureConfig) -> dict[str, Any]:
         if added.motion is None:
             graph.add_first(k, added.T_cw)
         else:
-            graph.add_keyframe(k, k - 1, added.motion)
+            motion = added.motion.widened(config.odometry_sigma_rad, config.odometry_sigma_m)
+            graph.add_keyframe(k, {k - 1: motion})
         for plane_id, plane in added.seen.items():
             graph.add_plane_observation(k, plane_id, plane)
         estimate = graph.optimise()

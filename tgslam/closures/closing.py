@@ -70,14 +70,23 @@ class GraphClosing:
         return Correction(self._motions(T_cw), tuple(closure.earlier for closure in found))
 
     def _add_odometry(self, keyframes: Sequence[Keyframe]) -> None:
+        """Tracking measures a pose against the map, that is, against the keyframes that its Gaussians move with.
+
+        Were it counted as a motion from the previous keyframe alone, what planes turn that one by would seem undone in
+        each step that still sees the older map, and the graph would drift away from both.
+        """
         latest, T_cw = len(keyframes) - 1, keyframes[-1].T_cw
+        self._applied.append(T_cw.copy())
         if latest == 0:
             self._graph.add_first(0, T_cw)
-            self._applied.append(T_cw.copy())
             return
-        T_ji = T_cw @ inverse(keyframes[-2].T_cw)
-        self._graph.add_keyframe(latest, latest - 1, RelativePose(T_ji, keyframes[-1].information))
-        self._applied.append(T_ji @ self._applied[-1])
+        config, information = self._config, keyframes[-1].information
+        odometry = {}
+        for earlier, share in keyframes[-1].seen.items():
+            motion = RelativePose(T_cw @ inverse(self._applied[earlier]), information)
+            motion = motion.widened(config.odometry_sigma_rad, config.odometry_sigma_m)
+            odometry[earlier] = RelativePose(motion.T_ji, share * motion.information)
+        self._graph.add_keyframe(latest, odometry)
 
     def _add_sightings(self, planes: PlaneRegistry) -> None:
         """What is new; everything anew where PGIs have merged, split or ended."""

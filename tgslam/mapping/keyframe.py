@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ class Keyframe:
     information: NDArray[np.float64]  # [6, 6] from tracking
     _colour: NDArray[np.uint8]
     _depth: NDArray[np.uint16]
+    seen: dict[int, float] = field(default_factory=dict)  # shares of the map in view by keyframe it was born with
     plane_ids: NDArray[np.int16] | None = None  # [H, W] PGI of each pixel, -1 = none; None = planes are not looked for
 
     @classmethod

@@ -14,13 +14,14 @@ from tgslam.config.schema import LossConfig, MappingConfig, PlanesConfig, Seedin
 from tgslam.depth import filled
 from tgslam.gaussian_map import GaussianMap
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, orthonormalized, transform_points
+from tgslam.mapping.coarse import halved, seen_in_part, seen_whole
 from tgslam.mapping.fusion import block_centre, depth_pyramid, fused_depth, sample, turned
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.refinement import Refiner
 from tgslam.mapping.seeding import cell_levels, cell_sizes, quadtree, seed
 from tgslam.mapping.surface import Surface
 from tgslam.mapping.viewpoints import Viewpoints
-from tgslam.types import Camera, Matrix4
+from tgslam.types import Camera, Gaussians, Matrix4
 
 if TYPE_CHECKING:
     from tgslam.mapping.planar import PlanarMapping, PlanarPixels
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
 _MIN_COSINE = 0.1  # a surface more grazing than this says nothing of the depth beside
 _MAX_SLANT = 0.1  # nor one whose depth changes by more within a block
 _NOTICED_M = 0.005  # by which keyframes have moved against each other, for the map between them to be refined
+_GUESS_SHARE = 0.8  # of a later guess of depth: an earlier one that is less is wrong
+_STEEPEST = 0.1  # deepest a Gaussian may be at the rim of the image, standard deviation over depth
+_OWNERS = 6  # keyframes at most
 _MIN_VIEWS = 3  # a Gaussian is judged invisible only after so many views
 
 
@@ -62,12 +66,14 @@ class Mapper:
         surface = Surface(
             keyframe, self.camera, self.gaussians, self.config.insert_sigmas * self.loss.depth_sigma_per_m2
         )
+        keyframe.seen = self._owners(surface)
         self.conflict += surface.seen_through
         self.support += surface.supported
         planes = self._observe_planes()
-        kept = ~(self.guessed & surface.measured) & ~self._too_coarse(keyframe, surface, planes)
-        self._keep(kept)
+        kept = ~self._disproved(keyframe, surface)
+        kept &= self._refined(keyframe, surface, planes)
         self._fuse(keyframe, surface, kept)
+        self._keep(np.append(kept, np.ones(self.gaussians.count - len(kept), bool)))
         self._insert(keyframe, planes)
         if self.planes and planes:
             self.planes.label(self.gaussians, keyframe.T_cw, planes)
@@ -101,6 +107,20 @@ class Mapper:
                 self.refiner.step(self.gaussians, self.keyframes[k], move_pose=False)
         self._prune()
 
+    def _owners(self, surface: Surface) -> dict[int, float]:
+        """What the last keyframe was tracked against: the earlier keyframes whose Gaussians it sees most, with their
+        shares of what it sees of them."""
+        if len(self.keyframes) < 2:
+            return {}
+        latest = len(self.keyframes) - 1
+        born = self.gaussians.host("birth_keyframe")[surface.supported]
+        counts = np.bincount(born, minlength=latest)
+        most = np.argsort(-counts, kind="stable")[:_OWNERS]
+        most = most[counts[most] > 0]
+        if not len(most):
+            return {latest - 1: 1.0}
+        return {int(k): float(counts[k] / counts[most].sum()) for k in most}
+
     def _observe_planes(self) -> PlanarPixels | None:
         """The PGIs in the last keyframe, which refinement hears of too."""
         if not self.planes:
@@ -126,19 +146,30 @@ class Mapper:
         cells = quadtree(colour, depth_m, wanted, self.seeding, self.loss.depth_sigma_per_m2, ids)
         born = len(self.keyframes) - 1
         new = seed(cells, normals_c, self.camera, keyframe.T_cw, born, self.seeding, ids)
+        guessed = measured_m[np.rint(cells.v).astype(int), np.rint(cells.u).astype(int)] <= 0
+        information = np.where(guessed, 0.0, cells.size_px**2 / self._sigma_m(cells.depth_m) ** 2)
+        self._append(new, guessed, information)
+
+    def _append(
+        self,
+        new: Gaussians,
+        guessed: NDArray[np.bool_],
+        information: NDArray[np.float64],
+        support: NDArray[np.int32] | None = None,
+        conflict: NDArray[np.int32] | None = None,
+    ) -> None:
+        none = np.zeros(len(new), np.int32)
         self.gaussians.append(new)
         self.refiner.append(len(new))
-        guessed = measured_m[np.rint(cells.v).astype(int), np.rint(cells.u).astype(int)] <= 0
         self.guessed = np.concatenate([self.guessed, guessed])
-        information = np.where(guessed, 0.0, cells.size_px**2 / self._sigma_m(cells.depth_m) ** 2)
         self.information = np.concatenate([self.information, information])
-        self.support = np.concatenate([self.support, np.zeros(len(new), np.int32)])
-        self.conflict = np.concatenate([self.conflict, np.zeros(len(new), np.int32)])
+        self.support = np.concatenate([self.support, none if support is None else support])
+        self.conflict = np.concatenate([self.conflict, none if conflict is None else conflict])
 
     def _fuse(self, keyframe: Keyframe, surface: Surface, kept: NDArray[np.bool_]) -> None:
         """Average the keyframe's depth and normals into the Gaussians that it supports."""
         use = surface.supported & kept
-        rows = np.flatnonzero(use[kept])
+        rows = np.flatnonzero(use)
         if not len(rows):
             return
         depth_m = keyframe.depth_m()
@@ -182,28 +213,35 @@ class Mapper:
         """Standard deviation of the sensor's depth."""
         return self.loss.depth_sigma_per_m2 * depth_m**2
 
-    def _too_coarse(self, keyframe: Keyframe, surface: Surface, planes: PlanarPixels | None) -> NDArray[np.bool_]:
-        """[N] Gaussians on the keyframe's surface that are much larger in it than it would seed there today.
+    def _disproved(self, keyframe: Keyframe, surface: Surface) -> NDArray[np.bool_]:
+        """[N] guesses that the keyframe does better than: by a measurement, or by a guess of its own that is farther.
 
-        They were seeded from afar or, on floors and walls, at a grazing angle. Only those well inside the image go, so
-        that the keyframe fills all that they leave.
+        What is beyond the sensor's range was put at its end; there it would hang before a camera that goes on.
         """
-        colour, depth_m = keyframe.colour(), keyframe.depth_m()
-        if planes:
-            depth_m = np.where(planes.depth_m > 0, planes.depth_m, depth_m)
+        guess_m = filled(keyframe.depth_m())
+        nearer = np.zeros(len(surface.z), bool)
+        nearer[surface.inside] = surface.z[surface.inside] < _GUESS_SHARE * guess_m[surface.v, surface.u]
+        return self.guessed & (surface.measured | nearer)
+
+    def _refined(self, keyframe: Keyframe, surface: Surface, planes: PlanarPixels | None) -> NDArray[np.bool_]:
+        """[N] false for Gaussians that are too large for the keyframe; parts of those that it cannot seed anew follow
+        at the end of the map."""
+        whole = seen_whole(self.gaussians, surface, self._limit_px(keyframe, planes))
+        part = seen_in_part(self.gaussians, surface, _STEEPEST)
+        parts, of = halved(self.gaussians, np.flatnonzero(part), surface, _STEEPEST, 1.0 / self.seeding.overlap)
+        share = 1.0 / np.bincount(of, minlength=len(part))[of]
+        self._append(parts, self.guessed[of], share * self.information[of], self.support[of], self.conflict[of])
+        return ~(whole | part)
+
+    def _limit_px(self, keyframe: Keyframe, planes: PlanarPixels | None) -> NDArray[np.float64]:
+        """[H, W] the largest standard deviation that Gaussians may have in the keyframe's image."""
+        measured_m = keyframe.depth_m()
+        depth_m = np.where(planes.depth_m > 0, planes.depth_m, measured_m) if planes else measured_m
         ids = planes.ids if planes else None
-        sizes = cell_sizes(colour, depth_m, self.seeding, self.loss.depth_sigma_per_m2, ids)
-        wanted_px = np.zeros(len(surface.z))
+        sizes = cell_sizes(keyframe.colour(), depth_m, self.seeding, self.loss.depth_sigma_per_m2, ids)
         smallest = self.seeding.smallest_cell_px
-        wanted_px[surface.inside] = sizes[surface.v // smallest, surface.u // smallest]
-        std_px = np.zeros(len(surface.z))
-        std_px[surface.inside] = surface.longest_px(self.gaussians)
-        margin = 2.0 * std_px[surface.inside]
-        whole = np.zeros(len(surface.z), bool)
-        whole[surface.inside] = (np.minimum(surface.u, self.camera.width - 1 - surface.u) > margin) & (
-            np.minimum(surface.v, self.camera.height - 1 - surface.v) > margin
-        )
-        return surface.supported & whole & (std_px > self.config.coarse_factor * self.seeding.overlap * wanted_px)
+        by_pixel = np.repeat(np.repeat(sizes, smallest, 0), smallest, 1)[: self.camera.height, : self.camera.width]
+        return self.config.coarse_factor * self.seeding.overlap * by_pixel.astype(np.float64)
 
     def _unexplained(self, keyframe: Keyframe, depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
         """[H, W] pixels that the map leaves open, or in front of whose surface the camera sees another one."""
