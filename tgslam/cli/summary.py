@@ -32,6 +32,7 @@ _LINES = (  # label, key, format
     ("plane precision", "plane_precision", "{:.1%}"),
     ("plane recall", "plane_recall", "{:.1%}"),
     ("plane id switches", "plane_switches_per_100", "{:.1f} in 100 frames"),
+    ("surface id switches", "plane_surface_switches_per_100", "{:.1f} in 100 frames"),
     ("plane normal error", "plane_normal_deg", "{:.2f} deg"),
     ("plane normal error, 95 %", "plane_normal_p95_deg", "{:.2f} deg"),
     ("plane offset error", "plane_offset_mm", "{:.1f} mm"),

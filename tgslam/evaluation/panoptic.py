@@ -20,8 +20,8 @@ IdImage = NDArray[np.int32]
 Overlaps = Mapping[tuple[int, int], int]  # (true label, predicted id) -> pixels
 
 _MATCH_IOU = 0.5  # above it at most one prediction fits a label, and one label a prediction
-_SHOWN_SHARE = 0.002  # of the image that an instance covers: less is a scrap
-_IDENTITY_SHARE = 0.25  # of a label's pixels that an id covers: less is no identity
+SHOWN_SHARE = 0.002  # of the image that an instance covers: less is a scrap
+IDENTITY_SHARE = 0.25  # of a label's pixels that an id covers: less is no identity
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def overlaps(labels: IdImage, ids: IdImage) -> Counter[tuple[int, int]]:
 
 def shown(pixels: Overlaps) -> tuple[frozenset[int], frozenset[int]]:
     """The labels and the ids that cover enough of one frame to be instances in it."""
-    least = _SHOWN_SHARE * sum(pixels.values())
+    least = SHOWN_SHARE * sum(pixels.values())
     sizes: tuple[Counter[int], Counter[int]] = Counter(), Counter()
     for pair, count in pixels.items():
         for size, value in zip(sizes, pair, strict=True):
@@ -123,7 +123,7 @@ def _identity(pixels: Mapping[int, int]) -> int | None:
     if not known:
         return None
     best = min(known, key=lambda id_: (-known[id_], id_))
-    return best if known[best] >= _IDENTITY_SHARE * sum(pixels.values()) else None
+    return best if known[best] >= IDENTITY_SHARE * sum(pixels.values()) else None
 
 
 def _ratio(part: float, whole: float) -> float | None:

@@ -28,6 +28,7 @@ from tgslam.evaluation.protocol import (
     image_metrics,
     trajectory_metrics,
 )
+from tgslam.evaluation.surfaces import SURFACE_KEY, surface_metrics
 from tgslam.evaluation.trajectory import align_poses
 from tgslam.output.log import read_log
 from tgslam.output.planes_io import read_planes
@@ -43,6 +44,7 @@ METRIC_KEYS = (
     *TRAJECTORY_KEYS,
     *IMAGE_KEYS,
     *INSTANCE_KEYS,
+    SURFACE_KEY,
     FLOATER_KEY,
     "stage_s",
 )
@@ -84,8 +86,8 @@ def evaluate_run(
     """Every metric that the files of a run and its input give: the one way for both `run` and `eval`.
 
     make_render: makes the function that renders the map; None leaves the image metrics null, as no source does.
-    make_read_ids: makes the function that reads which of the known planes the map shows; None leaves the metrics of
-        instances null, as a scene without known planes does.
+    make_read_ids: makes the function that reads which of the run's planes the map shows; None leaves the metrics of
+        instances and surfaces null, as a run without planes does.
     Raises OutputError when the run was cut off before it wrote its trajectory, or a file of it is damaged, and
     EvaluationError when the input has changed since.
     """
@@ -110,7 +112,10 @@ def evaluate_run(
         except EvaluationError as error:
             raise EvaluationError(f"{folder.trajectory}: {error}") from error
         metrics |= image_metrics(source, poses, run.gaussians, make_render(), stop_requested)
-        metrics |= _scene_metrics(run, source, poses, config, make_read_ids, stop_requested)
+        read_ids = make_read_ids(run.planes) if make_read_ids is not None and run.planes and poses else None
+        if read_ids is not None:
+            metrics |= surface_metrics(source, poses, run.gaussians, read_ids, stop_requested)
+        metrics |= _scene_metrics(run, source, poses, config, read_ids, stop_requested)
     return metrics
 
 
@@ -140,7 +145,7 @@ def _scene_metrics(
     source: RgbdSource,
     poses: Sequence[tuple[int, Matrix4]],
     config: EvaluationConfig,
-    make_read_ids: Callable[[Sequence[Plane]], ReadIds] | None,
+    read_ids: ReadIds | None,
     stop_requested: Callable[[], bool],
 ) -> dict[str, Any]:
     """What comparing with the scene itself gives; null for a recording, whose scene nobody knows."""
@@ -152,8 +157,7 @@ def _scene_metrics(
     T_alignment = _alignment(run.every_frame, groundtruth, config.association_tolerance_s)
     if T_alignment is not None:
         metrics[FLOATER_KEY] = floater_share(run.gaussians, truth, T_alignment)
-    if make_read_ids is not None and run.planes and poses:
-        read_ids = make_read_ids(run.planes)
+    if read_ids is not None and run.planes:
         metrics |= instance_metrics(run.planes, run.gaussians, poses, truth, T_alignment, read_ids, stop_requested)
     return metrics
 

@@ -24,6 +24,7 @@ from tgslam.types import Camera
 
 _CLOSING_PX = 7  # window in which a PGI may surround a pixel
 _CLOSING_SHARE = 0.6  # of its pixels that must be the PGI's
+_GLANCE_PX = 8  # between the pixels that tell whether a keyframe shows a plane at all
 _AGREEMENT = 5.0  # standard deviations of sensor and model between a PGI and a measurement that counts as its
 
 
@@ -64,6 +65,7 @@ class PlanarMapping:
         observation = self.registry.observe(view, depth_m, self.camera, keyframe.T_cw, number)
         for earlier in keyframes[:-1]:
             self._correct(earlier, observation.corrected)
+            self._complete(earlier, observation.created)
         ids = self._completed(self._closed(observation.id_image(view.labels)), depth_m, keyframe.T_cw)
         pixels = self._pixels(ids, depth_m, keyframe.T_cw)
         keyframe.plane_ids = pixels.ids.astype(np.int16)
@@ -111,6 +113,21 @@ class PlanarMapping:
             extents = self._extents(keyframe.depth_m(), keyframe.T_cw)
             ids = self._divided(keyframe.plane_ids.astype(np.int32), shown, extents)
             keyframe.plane_ids = ids.astype(np.int16)
+
+    def _complete(self, keyframe: Keyframe, plane_ids: Sequence[int]) -> None:
+        """A keyframe may show PGIs that only later ones have confirmed."""
+        assert keyframe.plane_ids is not None
+        new = {i: self.instances[i] for i in plane_ids if i in self.instances}
+        if not new:
+            return
+        depth_m, ids = keyframe.depth_m(), keyframe.plane_ids.astype(np.int32)
+        for step in (_GLANCE_PX, 1):  # most keyframes do not show them, which few pixels tell
+            part = np.s_[::step, ::step]
+            extents = KnownExtents(new, depth_m[part], self._rays[part], keyframe.T_cw, self.config, self.sigma_per_m2)
+            completed = extents.completed(ids[part])
+            if np.array_equal(completed, ids[part]):
+                return
+        keyframe.plane_ids = completed.astype(np.int16)
 
     def _completed(
         self, ids: NDArray[np.int32], depth_m: NDArray[np.float32], T_cw: NDArray[np.float64]

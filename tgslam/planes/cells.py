@@ -10,7 +10,7 @@ from scipy.ndimage import median_filter
 
 from tgslam import plane_fit
 from tgslam.plane_fit import CellGrid, Floats
-from tgslam.planes.moments import squared_residuals
+from tgslam.planes.moments import NOISE, squared_residuals
 
 Indices = NDArray[np.intp]
 
@@ -26,6 +26,21 @@ class CellGraph:
     moments: Floats  # [N, 11] with the noise's variance
     edges: Indices  # [E, 2] nodes, the smaller first
 
+    def squares(self, shape: tuple[int, int], side: int, sigmas: float) -> CellGraph:
+        """The same of squares of `side` x `side` cells, all of them planar and on one plane as cells have to be.
+
+        shape: rows and columns of cells. The squares that reach beyond are left out.
+        """
+        row, column = np.divmod(self.cell, shape[1])
+        rows, columns = shape[0] // side, shape[1] // side
+        inside = (row < rows * side) & (column < columns * side)
+        square = (row // side * columns + column // side)[inside]
+        moments = np.zeros((rows * columns, self.moments.shape[1]))
+        np.add.at(moments, square, self.moments[inside])
+        whole = np.bincount(square, minlength=len(moments)) == side**2
+        flat = whole & _fits(moments, moments[:, NOISE] / np.maximum(moments[:, 0], 1.0), sigmas)
+        return CellGraph(np.flatnonzero(flat), moments[flat], _neighbours(flat.reshape(rows, columns)))
+
 
 def planar_cells(depth_m: np.ndarray, grid: CellGrid, sigma: float, share: float, sigmas: float) -> CellGraph:
     """Cells of which at least that share is measured, and whose residual is at most so many times the noise.
@@ -37,11 +52,15 @@ def planar_cells(depth_m: np.ndarray, grid: CellGrid, sigma: float, share: float
     white = np.minimum(white, median_filter(white.reshape(grid.shape), 3).ravel())
     variance = np.clip(white, sigma**2, (_NOISIEST * sigma) ** 2)
     count = moments[:, 0]
-    fits = squared_residuals(moments) <= sigmas**2 * variance * np.maximum(count - 3, 1.0)
-    flat = fits & (count >= max(share * grid.cell_px**2, _FEWEST))
+    flat = _fits(moments, variance, sigmas) & (count >= max(share * grid.cell_px**2, _FEWEST))
     cell = np.flatnonzero(flat)
     nodes = np.column_stack([moments[cell], count[cell] * variance[cell]])
     return CellGraph(cell, nodes, _neighbours(flat.reshape(grid.shape)))
+
+
+def _fits(moments: Floats, variance: Floats, sigmas: float) -> NDArray[np.bool_]:
+    """[N] whether sets of points leave residuals of at most so many times noise of that variance [N]."""
+    return squared_residuals(moments) <= sigmas**2 * variance * np.maximum(moments[:, 0] - 3, 1.0)
 
 
 def _neighbours(flat: NDArray[np.bool_]) -> Indices:

@@ -12,10 +12,11 @@ from tgslam.config.schema import PlanesConfig
 from tgslam.plane_fit import CellGrid, Floats, PixelLabels, SegmentSums
 from tgslam.planes.bridging import Pieces, bridge
 from tgslam.planes.cells import CellGraph, planar_cells
+from tgslam.planes.layers import bordering, group_moments, parallel, part_layers, settle
 from tgslam.planes.merging import Agreement, Indices, agglomerate
-from tgslam.planes.moments import joining_cost, noise_of, planes_of, squared_residuals
+from tgslam.planes.moments import NOISE, joining_cost, noise_of, planes_of, squared_residuals, width_px
 from tgslam.planes.segment import PlaneSegment, PlaneView
-from tgslam.planes.statistics import Evidence, evidence, refined, width_px
+from tgslam.planes.statistics import Evidence, evidence, refined, totals
 from tgslam.types import Camera
 
 _ROBUST_ROUNDS = 2
@@ -23,6 +24,9 @@ _CHARBONNIER_SIGMAS = 1.5
 _RELIABLE_PART = 0.7  # of the limits beyond which there is no plane
 _PIECE_SHARE = 0.25  # of the least area, that pieces have before they are joined across gaps
 _MIN_CELLS = 2
+_LAYER_PIECES = 4  # times as large as a piece is a part that is taken out of one
+_LARGE_SHARE = 0.05  # of the image
+_SQUARE_CELLS = 4  # side of the squares that tell the sensor's far-reaching errors from those of a few pixels
 _FEWEST_PX = 6
 
 
@@ -34,38 +38,56 @@ def extract_planes(depth_m: np.ndarray, camera: Camera, config: PlanesConfig, si
     that other views have to confirm (small, thin, grazing, rough) come with reliable=False.
     """
     grid = CellGrid.across(camera, config.cells_across)
-    pieces = _pieces(depth_m, grid, config, sigma_per_m2)
+    pieces, agreement = _pieces(depth_m, grid, config, sigma_per_m2)
     if not len(pieces.moments):
         return PlaneView(np.full((camera.height, camera.width), -1, np.int32), ())
     pixels = PixelLabels(depth_m, grid, pieces.labels)
-    planes, noise = planes_of(pieces.moments), noise_of(pieces.moments)
+    noise, pairs = noise_of(pieces.moments), bordering(pieces.labels)
+    planes, _, _ = parallel(planes_of(pieces.moments), pieces.moments, pairs, agreement, grid.cell_px)
     spread = np.sqrt(squared_residuals(pieces.moments) / pieces.moments[:, 0])
     pixels.assign(planes, config.pixel_sigmas * np.clip(spread, noise, config.max_rms_sigmas * noise))
     for _ in range(_ROBUST_ROUNDS):
         before = planes
         sums = pixels.sums(before, _CHARBONNIER_SIGMAS * sigma_per_m2)
-        planes = refined(before, sums)
+        moments = np.column_stack([totals(sums, len(before)), noise**2])
+        moments[:, NOISE] *= moments[:, 0]
+        planes, aligned, stepped = parallel(refined(before, sums), moments, pairs, agreement, grid.cell_px)
     fewest_px = max(config.min_area_share * camera.width * camera.height, _FEWEST_PX)
     seen = _evidence(planes, planes - before, sums, grid, sigma_per_m2, fewest_px)
-    found = _judged(seen, noise / sigma_per_m2, grid, config)
+    found = _with_alignment(_judged(seen, noise / sigma_per_m2, grid, config), aligned)
     number = np.full(len(planes) + 1, -1, np.int32)
     number[[index for index, _ in found]] = np.arange(len(found))
-    return PlaneView(number[pixels.read()], tuple(segment for _, segment in found))
+    steps = frozenset((int(number[i]), int(number[j])) for i, j in stepped if number[i] >= 0 and number[j] >= 0)
+    return PlaneView(number[pixels.read()], tuple(segment for _, segment in found), steps)
 
 
-def _pieces(depth_m: np.ndarray, grid: CellGrid, config: PlanesConfig, sigma: float) -> Pieces:
-    """Groups of cells that lie on one plane each; what is too small to become a segment is left out."""
+def _pieces(depth_m: np.ndarray, grid: CellGrid, config: PlanesConfig, sigma: float) -> tuple[Pieces, Agreement]:
+    """Groups of cells that lie on one plane each; what is too small to become a segment is left out.
+
+    Returns with how far parts of one surface may differ.
+    """
     graph = planar_cells(depth_m, grid, sigma, config.cell_share, config.cell_sigmas)
-    agreement = Agreement.seen_among(graph.moments, graph.edges, sigma, config.join_sigmas, config.join_shift_sigmas)
+    squares = graph.squares(grid.shape, _SQUARE_CELLS, config.cell_sigmas)
+    agreement = Agreement.seen_among(graph, squares, sigma, config.join_sigmas, config.join_shift_sigmas)
     lenient = dataclasses.replace(agreement, shift_m=config.join_shift_m)
     group, moments = agglomerate(graph.moments, _continuous(graph, agreement), lenient)
-    least_px = _PIECE_SHARE * config.min_area_share * grid.camera.width * grid.camera.height
-    kept = (moments[:, 0] >= least_px) & (np.bincount(group, minlength=len(moments)) >= _MIN_CELLS)
-    number = np.where(kept, np.cumsum(kept) - 1, -1)
+    image_px = grid.camera.width * grid.camera.height
+    least_px = _PIECE_SHARE * config.min_area_share * image_px
+    group = np.where(moments[group, 0] >= least_px, group, -1)
+    group = part_layers(graph, grid.shape, group, lenient, _LAYER_PIECES * least_px)
+    group = settle(graph, grid.shape, group, _LARGE_SHARE * image_px)
+    pieces = _numbered(graph, group, grid, least_px)
+    return bridge(pieces, runtime.to_host(depth_m), grid, agreement, config.across_area_m2), lenient
+
+
+def _numbered(graph: CellGraph, group: Indices, grid: CellGrid, least_px: float) -> Pieces:
+    """The groups [N] that have several cells and `least_px` points, numbered from 0."""
+    moments = group_moments(graph, group)[:-1]
+    kept = (moments[:, 0] >= least_px) & (np.bincount(group[group >= 0], minlength=len(moments)) >= _MIN_CELLS)
+    number = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)  # -1 takes the last one
     labels = np.full(len(grid), -1, np.int32)
     labels[graph.cell] = number[group]
-    pieces = Pieces(labels.reshape(grid.shape), moments[kept])
-    return bridge(pieces, runtime.to_host(depth_m), grid, agreement, config.across_area_m2)
+    return Pieces(labels.reshape(grid.shape), moments[kept])
 
 
 def _continuous(graph: CellGraph, agreement: Agreement) -> Indices:
@@ -97,6 +119,18 @@ def _judged(
             found.append((index, dataclasses.replace(seen.segment, reliable=reliable)))
     found.sort(key=lambda item: (-item[1].area_px, item[0]))
     return found[: config.max_segments]
+
+
+def _with_alignment(found: list[tuple[int, PlaneSegment]], aligned: dict[int, int]) -> list[tuple[int, PlaneSegment]]:
+    """Index and segment, where those that have their normal from another one know it as well as that."""
+    segments = dict(found)
+    for small, large in aligned.items():
+        if small in segments and large in segments:
+            covariance = np.zeros((3, 3))
+            covariance[:2, :2] = segments[large].covariance[:2, :2]
+            covariance[2, 2] = segments[small].covariance[2, 2]
+            segments[small] = dataclasses.replace(segments[small], covariance=covariance)
+    return list(segments.items())
 
 
 def _bend(seen: Evidence, config: PlanesConfig) -> float:

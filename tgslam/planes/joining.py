@@ -27,10 +27,22 @@ class Joining:
     def __init__(self, config: PlanesConfig, tolerance: Tolerance) -> None:
         self._config, self._tolerance = config, tolerance
         self._apart: set[frozenset[PlanarInstance]] = set()  # coplanar pairs between which a view looks through
+        self._steps: set[frozenset[PlanarInstance]] = (
+            set()
+        )  # those of them of which one stands a little before the other
 
     def part(self, a: PlanarInstance, b: PlanarInstance) -> None:
         """A gap parts two instances in a view."""
         self._apart.add(frozenset((a, b)))
+
+    def step(self, a: PlanarInstance, b: PlanarInstance) -> None:
+        """A step parts two instances in a view."""
+        self.part(a, b)
+        self._steps.add(frozenset((a, b)))
+
+    def on_step(self, a: PlanarInstance, b: PlanarInstance) -> bool:
+        """Whether a step has parted two instances in a view."""
+        return frozenset((a, b)) in self._steps
 
     def parted_from(self, instance: PlanarInstance) -> list[PlanarInstance]:
         """The instances that a view has parted from one."""
@@ -38,8 +50,10 @@ class Joining:
 
     def replace(self, absorbed: PlanarInstance, kept: PlanarInstance) -> None:
         """What parts one instance from others parts the one that has absorbed it from them."""
-        renamed = (frozenset(kept if i is absorbed else i for i in pair) for pair in self._apart)
-        self._apart = {pair for pair in renamed if len(pair) == 2}
+        self._apart, self._steps = (
+            {pair for known in pairs if len(pair := frozenset(kept if i is absorbed else i for i in known)) == 2}
+            for pairs in (self._apart, self._steps)
+        )
 
     def twins(
         self, touched: Sequence[PlanarInstance], everything: Sequence[PlanarInstance], samples: Samples | None

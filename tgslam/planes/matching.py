@@ -97,6 +97,8 @@ class ViewMatching:
         for i in np.flatnonzero(admitted):
             instance = self.instances[i]
             pieces = self.pieces(instance)
+            if any(self._is_step(segment, piece) for piece in pieces):
+                continue
             fits_well = bool(misfit[i] <= WELL)
             if not (self._coplanar(segment, pieces) if pieces else fits_well or self._overlaps(segment, int(i))):
                 continue
@@ -108,6 +110,11 @@ class ViewMatching:
             if score > best_score:
                 best, best_score = instance, score
         return best
+
+    def steps(self) -> list[tuple[PlanarInstance, PlanarInstance]]:
+        """The instances that this view shows with a step between them."""
+        pairs = [(self.owner[i], self.owner[j]) for i, j in sorted(self.samples.view.steps)]
+        return [(a, b) for a, b in pairs if a is not None and b is not None and a is not b]
 
     def parted(self, segment: int) -> list[PlanarInstance]:
         """The instances over whose extent an unmatched segment lies, but beyond a gap that parts it from them."""
@@ -186,6 +193,10 @@ class ViewMatching:
 
     def _overlaps(self, segment: int, index: int) -> bool:
         return index in self.sights and bool(self._meet(self._overlap([index]))[segment, 0])
+
+    def _is_step(self, segment: int, other: int) -> bool:
+        steps = self.samples.view.steps
+        return (segment, other) in steps or (other, segment) in steps
 
     def _coplanar(self, segment: int, pieces: list[int]) -> bool:
         own, others = self.local[segment : segment + 1], self.local[pieces]

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.plane_fit import Floats
+from tgslam.planes.cells import CellGraph
 from tgslam.planes.moments import NOISE, joining_cost, squared_residuals
 
 Indices = NDArray[np.intp]
@@ -24,22 +25,32 @@ class Agreement:
     sigmas: float  # allowed for the noise of the two fits
     shift_sigmas: float  # allowed beyond it, root mean square over the smaller set: sensors bend planes
     shift_m: float = 0.0  # likewise, of depth: real surfaces are not quite planes
+    common: float = 0.0  # 1/m^2, allowed however large the sets are: neighbouring measurements err alike
 
     @classmethod
     def seen_among(
-        cls, moments: Floats, edges: Indices, sigma: float, sigmas: float, most_shift_sigmas: float
+        cls, cells: CellGraph, squares: CellGraph, sigma: float, sigmas: float, most_shift_sigmas: float
     ) -> Agreement:
         """As much shift as the sensor itself shows, at most `most_shift_sigmas`.
 
-        Most neighbouring cells lie on one surface: how far apart their planes are in the median is the sensor's own
-        correlated error, be it white noise (0.2 sigma) or a real sensor's steps and waves (0.6 sigma).
+        Most neighbours lie on one surface: how far apart their planes are in the median is the sensor's own error.
+        What several pixels have in common shifts cells, but hardly squares of many cells; a real sensor's steps and
+        waves shift both, and so they may shift larger sets.
         """
-        if not len(edges):
-            return cls(sigma, sigmas, most_shift_sigmas)
-        first, second = edges.T
-        cost = joining_cost(moments, squared_residuals(moments), first, second)
-        median = float(np.median(cost / np.minimum(moments[first, 0], moments[second, 0])))
-        return cls(sigma, sigmas, min(_OVER_MEDIAN * np.sqrt(median) / sigma, most_shift_sigmas))
+        near = cls._median_shift(cells, sigma, most_shift_sigmas)
+        far = min(near, cls._median_shift(squares, sigma, most_shift_sigmas))
+        a_cell = float(np.median(cells.moments[:, 0])) if len(cells.moments) else 0.0
+        return cls(sigma, sigmas, far, common=(near**2 - far**2) * sigma**2 * a_cell)
+
+    @staticmethod
+    def _median_shift(graph: CellGraph, sigma: float, most: float) -> float:
+        """Three standard deviations of the shift between neighbours in sigmas; `most` if it is more or not known."""
+        if not len(graph.edges):
+            return most
+        first, second = graph.edges.T
+        cost = joining_cost(graph.moments, squared_residuals(graph.moments), first, second)
+        median = float(np.median(cost / np.minimum(graph.moments[first, 0], graph.moments[second, 0])))
+        return min(_OVER_MEDIAN * float(np.sqrt(median)) / sigma, most)
 
     def admits(self, cost: Floats, first: Floats, second: Floats) -> NDArray[np.bool_]:
         """Whether the `joining_cost` [E], 1/m^2, of pairs of sets with those moments [E, 11] is small enough [E]."""
@@ -47,7 +58,7 @@ class Agreement:
         inverse_depth = (first[:, 6] + second[:, 6]) / np.maximum(first[:, 0] + second[:, 0], 1.0)
         shift = (self.shift_sigmas * self.sigma) ** 2 + (self.shift_m * inverse_depth**2) ** 2
         variance = (first[:, NOISE] + second[:, NOISE]) / np.maximum(first[:, 0] + second[:, 0], 1.0)
-        return cost <= self.sigmas**2 * variance + shift * fewer
+        return cost <= self.sigmas**2 * variance + self.common + shift * fewer
 
 
 def agglomerate(moments: Floats, edges: Indices, agreement: Agreement) -> tuple[Indices, Floats]:

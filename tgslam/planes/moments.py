@@ -39,6 +39,17 @@ def noise_of(moments: Floats) -> Floats:
     return np.sqrt(moments[:, NOISE] / np.maximum(moments[:, 0], 1.0))
 
 
+def width_px(moments: Floats) -> float:
+    """Of a rectangle that scatters like the points, the shorter side, in px."""
+    return float(np.sqrt(12.0 * max(np.linalg.eigvalsh(scatter(moments))[0], 0.0)))
+
+
+def scatter(moments: Floats) -> Floats:
+    """[2, 2] px^2, covariance of the points' places in the image."""
+    n, x, y, xx, xy, yy = moments[:6]
+    return np.array([[xx - x * x / n, xy - x * y / n], [xy - x * y / n, yy - y * y / n]]) / n
+
+
 def joining_cost(moments: Floats, squares: Floats, first: NDArray[np.intp], second: NDArray[np.intp]) -> Floats:
     """[E] 1/m^2: by how much the squared residuals of sets `first` and `second` [E] grow if one plane serves both.
 

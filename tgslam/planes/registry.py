@@ -135,6 +135,8 @@ class PlaneRegistry:
                     found = PlanarInstance(matching.world(segment), self._config)
                     corrected |= self._part(segment, found, matching)
                 self._give(matching, segment, found, keyframe)
+        for pair in matching.steps():
+            self._joining.step(*pair)
         return corrected | self._divide(matching)
 
     def _give(self, matching: ViewMatching, segment: int, instance: PlanarInstance, keyframe: int) -> None:
@@ -149,11 +151,19 @@ class PlaneRegistry:
         return set(parted)
 
     def _divide(self, matching: ViewMatching) -> set[PlanarInstance]:
-        """Where a view shows both of two parted instances, what it shows of the one is no part of the other."""
+        """Where a view shows both of two parted instances, what it shows of the one is no part of the other.
+
+        At a step, only what it shows of the smaller one counts: else the border's noise would wear that away.
+        """
         corrected = set()
         for segment, owner in enumerate(matching.owner):
-            for other in self._joining.parted_from(owner) if owner is not None else ():
-                if matching.pieces(other) and other.support.remove(matching.samples.footprint(segment, other.support)):
+            if owner is None:
+                continue
+            for other in self._joining.parted_from(owner):
+                worn = self._joining.on_step(owner, other) and len(owner.support) > len(other.support)
+                if worn or not matching.pieces(other):
+                    continue
+                if other.support.remove(matching.samples.footprint(segment, other.support)):
                     corrected.add(other)
         return corrected
 

@@ -33,6 +33,7 @@ class PlaneView:
 
     labels: NDArray[np.int32]  # [H, W] index into segments, -1 = on no plane
     segments: tuple[PlaneSegment, ...]  # largest first
+    steps: frozenset[tuple[int, int]] = frozenset()  # adjoining segments that are level but for a step between them
 
 
 def tangents(normal: Vector) -> Vector:

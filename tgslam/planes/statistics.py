@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tgslam.plane_fit import CellGrid, Floats, SegmentSums
-from tgslam.planes.moments import information, planes_of
+from tgslam.planes.moments import information, planes_of, scatter, width_px
 from tgslam.planes.segment import PlaneSegment, tangents
 
 _CLUSTER_CELLS = 4  # side of the squares of cells within which noise may be correlated
@@ -75,17 +75,6 @@ def evidence(plane: Floats, change: Floats, rows: SegmentSums, grid: CellGrid, s
     )
 
 
-def width_px(moments: Floats) -> float:
-    """Of a rectangle that scatters like the points, the shorter side, in px."""
-    return float(np.sqrt(12.0 * max(np.linalg.eigvalsh(_scatter(moments))[0], 0.0)))
-
-
-def _scatter(moments: Floats) -> Floats:
-    """[2, 2] px^2, covariance of the points' places in the image."""
-    n, x, y, xx, xy, yy = moments[:6]
-    return np.array([[xx - x * x / n, xy - x * y / n], [xy - x * y / n, yy - y * y / n]]) / n
-
-
 def _covariance(
     moments: Floats, p: Floats, normal: Floats, offset: float, centroid: Floats, grid: CellGrid, variance: float
 ) -> Floats:
@@ -110,7 +99,7 @@ def _correlation(residual: Floats, rows: SegmentSums, grid: CellGrid, sigma: flo
     """
     cells = np.stack(np.divmod(rows.cell, grid.shape[1]), axis=1)
     square = cells[:, 0] // _CLUSTER_CELLS * grid.shape[1] + cells[:, 1] // _CLUSTER_CELLS
-    _, axes = np.linalg.eigh(_scatter(rows.moments.sum(axis=0)))
+    _, axes = np.linalg.eigh(scatter(rows.moments.sum(axis=0)))
     places = rows.moments[:, 1:3] / rows.moments[:, :1]
     strips = np.rint(places @ axes / grid.cell_px).astype(np.intp)
     strips -= strips.min(axis=0)

@@ -1,0 +1,116 @@
+"""Surfaces a little before a larger one: found in single views, kept apart by the registry, told to earlier views."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tests.plane_views import DEPTH_SIGMA_PER_M2, Rectangle, cast, looking
+from tgslam import runtime
+from tgslam.config.schema import PlanesConfig
+from tgslam.mapping.planar import PlanarMapping
+from tgslam.planes.extraction import extract_planes
+from tgslam.planes.layers import bordering
+from tgslam.planes.registry import PlaneRegistry
+from tgslam.planes.segment import PlaneView
+from tgslam.types import Camera
+
+CAMERA = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
+CONFIG = PlanesConfig()
+WALL = Rectangle((0.0, 2.0, 1.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (6.0, 3.0))
+BOARD = Rectangle((0.0, 1.985, 0.6), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (6.0, 0.08))
+ALONG = [looking((x, 0.0, 1.2), (x + 0.1, 2.0, 0.9)) for x in np.linspace(-0.5, 0.5, 8)]
+
+
+def measured(rectangles: list[Rectangle], T_cw: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Depth with the sensor's noise, and the rectangle of each pixel."""
+    depth_m, labels = cast(rectangles, CAMERA, T_cw)
+    noise = DEPTH_SIGMA_PER_M2 * depth_m**2 * np.random.default_rng(seed).standard_normal(depth_m.shape)
+    return np.where(depth_m > 0, depth_m + noise, 0.0).astype(np.float32), labels
+
+
+def seen(depth_m: np.ndarray) -> PlaneView:
+    return extract_planes(runtime.to_device(depth_m), CAMERA, CONFIG, DEPTH_SIGMA_PER_M2)
+
+
+def of_board(view: PlaneView, labels: np.ndarray) -> int:
+    """The segment that most of the board's pixels belong to."""
+    return int(np.argmax(np.bincount(view.labels[labels == 1] + 1)) - 1)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_board_on_a_wall_is_a_segment_of_its_own_and_parallel_to_it(seed: int) -> None:
+    depth_m, labels = measured([WALL, BOARD], ALONG[3], seed)
+    view = seen(depth_m)
+    board = of_board(view, labels)
+    assert board > 0
+    assert np.mean(view.labels[labels == 1] == board) > 0.7
+    assert np.mean(view.labels[labels == 0] == board) < 0.02
+    assert (board, 0) in view.steps
+    segment, wall = view.segments[board], view.segments[0]
+    assert segment.normal_c @ wall.normal_c == pytest.approx(1.0, abs=1e-9)
+    assert wall.offset_m - segment.offset_m == pytest.approx(0.015, abs=0.004)
+    np.testing.assert_allclose(segment.covariance[:2, :2], wall.covariance[:2, :2])
+
+
+@pytest.mark.parametrize("wave_m", [0.0, 0.004])
+def test_a_wall_without_a_board_is_one_surface_even_where_it_is_not_quite_plane(wave_m: float) -> None:
+    depth_m, _ = measured([WALL], ALONG[3])
+    columns = np.arange(CAMERA.width)
+    view = seen((depth_m + wave_m * np.sin(columns / 40.0)).astype(np.float32))
+    assert len(view.segments) == 1
+    assert not view.steps
+
+
+def test_the_registry_keeps_a_board_and_its_wall_apart() -> None:
+    registry = PlaneRegistry(CONFIG, DEPTH_SIGMA_PER_M2)
+    ids = []
+    for keyframe, T_cw in enumerate(ALONG):
+        depth_m, labels = measured([WALL, BOARD], T_cw, keyframe)
+        view = seen(depth_m)
+        found = registry.observe(view, depth_m, CAMERA, T_cw, keyframe)
+        ids.append((found.ids[0], found.ids[of_board(view, labels)]))
+    walls, boards = {wall for wall, _ in ids}, {board for _, board in ids if board >= 0}
+    assert len(walls) == len(boards) == 1
+    assert walls != boards
+    (board,), (wall,) = boards, walls
+    assert [other.id for other in registry.parted_from(board)] == [wall]
+    normal = registry.instances[board].normal_w
+    assert np.degrees(np.arccos(min(normal @ registry.instances[wall].normal_w, 1.0))) < 0.3
+
+
+def test_keyframes_before_a_plane_was_confirmed_show_it_too() -> None:
+    mapping, keyframes = PlanarMapping(CAMERA, CONFIG, DEPTH_SIGMA_PER_M2), []
+    masks = []
+    for index, T_cw in enumerate(ALONG):
+        depth_m, labels = measured([WALL, BOARD], T_cw, index)
+        keyframes.append(SimpleNamespace(T_cw=T_cw, depth_m=lambda depth_m=depth_m: depth_m, plane_ids=None))
+        masks.append(labels == 1)
+        mapping.observe(keyframes)
+    latest = keyframes[-1].plane_ids[masks[-1]]
+    board = int(np.bincount(latest[latest >= 0]).argmax())
+    assert min(mapping.instances[board].keyframes) == 0
+    assert np.mean(keyframes[0].plane_ids[masks[0]] == board) > 0.6
+
+
+def test_bordering_labels_are_listed_in_both_orders() -> None:
+    labels = np.array([[0, 0, 1], [-1, 2, 1]], np.int32)
+    assert bordering(labels).tolist() == [[0, 1], [0, 2], [1, 0], [1, 2], [2, 0], [2, 1]]
+    assert len(bordering(np.full((2, 2), -1, np.int32))) == 0
+
+
+def test_a_boards_extent_is_not_worn_away_by_the_wall_beside_it() -> None:
+    registry = PlaneRegistry(CONFIG, DEPTH_SIGMA_PER_M2)
+    for keyframe in range(12):
+        depth_m, labels = measured([WALL, BOARD], ALONG[4], keyframe)
+        view = seen(depth_m)
+        found = registry.observe(view, depth_m, CAMERA, ALONG[4], keyframe)
+    board = registry.instances[int(found.ids[of_board(view, labels)])]
+    wall = registry.instances[int(found.ids[0])]
+    in_view = Rectangle((0.1, 1.985, 0.6), BOARD.along, BOARD.across, (2.0, 0.08))
+    x, z = np.meshgrid(np.linspace(-0.9, 0.9, 37), [-0.01, 0.01])
+    places = np.array(in_view.centre) + np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
+    assert np.mean(board.support.holds(board.support.cells_of(places))) > 0.95
+    assert np.mean(wall.support.holds(wall.support.cells_of(places))) < 0.3

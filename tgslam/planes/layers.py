@@ -1,0 +1,196 @@
+"""Surfaces a little before or behind a larger one, as skirting boards and panels are, out of which agglomeration grows.
+
+Single cells do not tell such a step from noise, and so may join the larger surface. Held against its plane, all of them
+stand off it the same way.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from tgslam.plane_fit import Floats, Labels
+from tgslam.planes.cells import CellGraph
+from tgslam.planes.merging import Agreement, Indices
+from tgslam.planes.moments import NOISE, information, joining_cost, planes_of, squared_residuals, width_px
+
+_WINDOW_CELLS = 3  # over which misfits are averaged
+_OFF_SIGMAS = 2.5  # of such means: beyond it a cell stands off
+_TYPICAL = 0.75  # quantile of the misfits of such cells that is the step's
+_DEVIATION = 1.4826  # standard deviations that a median of magnitudes stands for
+_ROUNDS = 3
+_NEIGHBOUR = 6.0  # squared sigmas of misfit that a neighbour of the same surface is worth
+
+_LARGE = 6.0  # likewise, that the surface is large, and needs no plane of its own
+_LARGER = 4.0  # times as many points has a surface that another one is taken to be parallel to
+_NARROW_CELLS = 5  # wide is a strip that may seem turned by as much as surfaces stray from planes
+_FEWEST_PX = 6.0  # of what is compared
+_STEP_M = 0.1  # along the line of sight at most from one to the other
+
+_SIDES = ((0, 1), (0, -1), (1, 0), (-1, 0))
+
+
+def part_layers(
+    graph: CellGraph, shape: tuple[int, int], group: Indices, agreement: Agreement, least_px: float
+) -> Indices:
+    """The group of each node [N], -1 = none, where parts of a group that stand off its plane are groups of their own.
+
+    A part is connected, of one side of the plane, at least `least_px` points, and its plane does not agree with that of
+    the rest. shape: rows and columns of cells.
+    """
+    group, moments = group.copy(), group_moments(graph, group)
+    misfit = _misfits(graph, planes_of(moments)[group])
+    for index in np.flatnonzero(moments[:, 0] > 2 * least_px):
+        nodes = np.flatnonzero(group == index)
+        off = _standing_off(misfit[nodes], graph.cell[nodes], shape)
+        for part in off:
+            chosen = graph.moments[nodes[part]].sum(axis=0)
+            pair = np.stack([chosen, moments[index] - chosen])
+            if chosen[0] >= least_px and not _agree(pair, agreement):
+                group[nodes[part]] = group.max() + 1
+    return group
+
+
+def settle(graph: CellGraph, shape: tuple[int, int], group: Indices, large_px: float) -> Indices:
+    """The group [N] of each node, where it belongs to that one whose plane it fits best, its neighbours having a say.
+
+    It may change to the groups of its neighbours, and to all of more than `large_px` points: those go on behind things.
+    Parts that are not connected are groups of their own then. -1 stays -1.
+    """
+    grid = np.full(shape, -1, np.intp)
+    for _ in range(_ROUNDS):
+        moments = group_moments(graph, group)
+        planes, large = planes_of(moments), np.flatnonzero(moments[:, 0] > large_px)
+        grid.ravel()[graph.cell] = group
+        around = np.stack([_shifted(grid, side).ravel()[graph.cell] for side in _SIDES])
+        others = ((around != group) & (around >= 0)).any(axis=0) | ~np.isin(group, large)
+        open_ = np.flatnonzero((group >= 0) & others)
+        settled = group.copy()
+        settled[open_] = _choice(graph.moments[open_], group[open_], around[:, open_], large, planes)
+        if (settled == group).all():
+            break
+        group = settled
+    return _connected(graph, shape, group)
+
+
+def parallel(
+    planes: Floats, moments: Floats, pairs: Indices, agreement: Agreement, cell_px: int
+) -> tuple[Floats, dict[int, int], list[tuple[int, int]]]:
+    """The planes [P, 3], where those that do not differ from a larger neighbour but by a small step are parallel to it.
+
+    A narrow strip hardly tells how it is turned about its length, and what its borders take in from the surfaces beside
+    it turns it: what is fixed to a wall mostly is as the wall is. moments: [P, 11] of the points that the planes were
+    fitted to. pairs: [K, 2] of planes that adjoin, see `bordering`. Returns with the larger one by the smaller
+    one that is parallel to it, and the pairs (smaller, larger) that a step parts: more of it than the sensor may feign
+    or a surface may have.
+    """
+    aligned: dict[int, int] = {}
+    result, stepped = planes.copy(), []
+    size_px = moments[:, 0]
+    beside = (size_px[pairs[:, 1]] >= _LARGER * size_px[pairs[:, 0]]) & (size_px[pairs[:, 0]] >= _FEWEST_PX)
+    for small, large in pairs[beside]:
+        weight, reference = information(moments[small]), planes[large]
+        size = float(reference @ weight @ reference)
+        scale = float(reference @ weight @ planes[small]) / size
+        depth_m = moments[small, 0] / max(float(weight[0] @ planes[small]), 1e-9)
+        rest = planes[small] - scale * reference
+        noise = agreement.sigmas**2 * moments[small, NOISE] / moments[small, 0] + agreement.common
+        shift = (agreement.shift_m / depth_m**2) ** 2 * moments[small, 0]
+        allowed = noise + shift if width_px(moments[small]) <= _NARROW_CELLS * cell_px else noise
+        if abs(scale - 1.0) * depth_m <= _STEP_M and float(rest @ weight @ rest) <= allowed:
+            result[small] = scale * reference
+            aligned[int(small)] = int(large)
+            bent = (agreement.shift_sigmas * agreement.sigma) ** 2 * moments[small, 0]
+            if (scale - 1.0) ** 2 * size > noise + shift + bent:
+                stepped.append((int(small), int(large)))
+    return result, aligned, stepped
+
+
+def bordering(labels: Labels) -> Indices:
+    """[K, 2] the pairs of labels in adjoining cells, in both orders."""
+    across = np.stack([labels[:, :-1].ravel(), labels[:, 1:].ravel()], axis=1)
+    down = np.stack([labels[:-1].ravel(), labels[1:].ravel()], axis=1)
+    pairs = np.concatenate([across, down])
+    pairs = pairs[(pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])]
+    base = int(labels.max(initial=0)) + 1
+    keys = np.unique(np.concatenate([pairs @ (base, 1), pairs @ (1, base)]))
+    return np.stack(np.divmod(keys, base), axis=1).astype(np.intp)
+
+
+def _choice(moments: Floats, group: Indices, around: Indices, large: Indices, planes: Floats) -> Indices:
+    """The best group [K] of nodes with moments [K, 11], out of their own [K], those around [4, K] and large ones."""
+    choices = np.concatenate([group[None], around, np.broadcast_to(large[:, None], (len(large), len(group)))])
+    cost = np.stack([_squares(moments, planes[choice]) for choice in choices])
+    cost -= _NEIGHBOUR * (choices[:, None] == around[None]).sum(axis=1) + _LARGE * np.isin(choices, large)
+    cost[choices < 0] = np.inf
+    return np.asarray(choices[np.argmin(cost, axis=0), np.arange(len(group))], np.intp)
+
+
+def _connected(graph: CellGraph, shape: tuple[int, int], group: Indices) -> Indices:
+    """The groups [N] numbered anew, each connected part of one for itself; -1 stays."""
+    same = graph.edges[(group[graph.edges[:, 0]] == group[graph.edges[:, 1]])]
+    links = coo_array((np.ones(len(same)), (same[:, 0], same[:, 1])), shape=(len(group), len(group)))
+    part = connected_components(links, directed=False)[1]
+    return np.where(group < 0, -1, part)
+
+
+def group_moments(graph: CellGraph, group: Indices) -> Floats:
+    """[G, 11] of the groups 0 .. G - 1, and an empty one after them that stands for -1."""
+    moments = np.zeros((int(group.max(initial=-1)) + 2, graph.moments.shape[1]))
+    np.add.at(moments, group, graph.moments)
+    moments[-1] = 0.0
+    return moments
+
+
+def _misfits(graph: CellGraph, planes: Floats) -> Floats:
+    """[N] 1/m: mean of measured less predicted inverse depth of each node, for one plane [N, 3] each."""
+    n, x, y, w = graph.moments.T[[0, 1, 2, 6]]
+    misfits: Floats = (w - planes[:, 0] * n - planes[:, 1] * x - planes[:, 2] * y) / n
+    return misfits
+
+
+def _squares(moments: Floats, planes: Floats) -> Floats:
+    """[N] sum of squared misfits of nodes with moments [N, 11], in sigmas of their noise, for one plane [N, 3] each."""
+    n, x, y, xx, xy, yy, w, xw, yw, ww = moments.T[:NOISE]
+    a, b, c = planes.T
+    squares = ww - 2 * (a * w + b * xw + c * yw) + a * a * n + b * b * xx + c * c * yy
+    squares += 2 * (a * b * x + a * c * y + b * c * xy)
+    result: Floats = squares * n / moments[:, NOISE]
+    return result
+
+
+def _standing_off(misfit: Floats, cell: Indices, shape: tuple[int, int]) -> list[NDArray[np.bool_]]:
+    """The connected parts of a surface's nodes, as masks [K], that stand off its plane by `misfit` [K], 1/m."""
+    mask, image = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    mask.ravel()[cell], image.ravel()[cell] = 1.0, misfit
+    window = (_WINDOW_CELLS, _WINDOW_CELLS)
+    mean = (cv2.blur(image, window) / np.maximum(cv2.blur(mask, window), 1e-6)).ravel()[cell]
+    limit = _OFF_SIGMAS * _DEVIATION * float(np.median(np.abs(mean)))
+    parts = []
+    for side in (1.0, -1.0):
+        image = np.zeros(shape, np.float32)
+        image.ravel()[cell] = side * mean > limit
+        found, count = label(image, np.ones((3, 3)))
+        number = found.ravel()[cell]
+        for index in range(1, count + 1):
+            part, height = number == index, side * misfit
+            # Means reach beyond the part itself
+            parts.append(part & (height > 0.5 * np.quantile(height[part], _TYPICAL)))
+    return parts
+
+
+def _agree(pair: Floats, agreement: Agreement) -> bool:
+    """Whether one plane may serve the two sets with moments [2, 11]."""
+    cost = joining_cost(pair, squared_residuals(pair), np.array([0]), np.array([1]))
+    return bool(agreement.admits(cost, pair[:1], pair[1:])[0])
+
+
+def _shifted(grid: Indices, side: tuple[int, int]) -> Indices:
+    """What stands at that side of each cell; -1 beyond the border."""
+    padded = np.pad(grid, 1, constant_values=-1)
+    row, column = side
+    return padded[1 + row : 1 + row + grid.shape[0], 1 + column : 1 + column + grid.shape[1]]
