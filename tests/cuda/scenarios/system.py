@@ -37,7 +37,8 @@ def run(frames: int = 5, height: int = 60, width: int = 80) -> dict[str, np.ndar
     camera = Camera(width, height, 0.8 * width, 0.8 * width, 0.5 * width - 0.5, 0.5 * height - 0.5)
     config = Config()
     mapping = replace(config.mapping, iterations=2, final_iterations=2)
-    keyframes = replace(config.keyframes, max_interval=3)
+    # Keyframes by time alone: whether 8 % of so small an image are new is a matter of single pixels
+    keyframes = replace(config.keyframes, max_interval=3, max_unexplained=1.0)
     system = Slam(camera, replace(config, mapping=mapping, keyframes=keyframes))
     for index in range(frames):
         system.process_frame(_frame(camera, index))
