@@ -247,14 +247,14 @@ class ClosureConfig:
     """The pose graph over keyframes, and what planes seen again say to it (sections 3.3, 3.4)."""
 
     enabled: bool = setting(False)  # False: keyframes stay where tracking has put them
-    formulation: str = setting("landmarks", choices=("closures", "landmarks", "both"))  # edges, planes as variables
+    formulation: str = setting("closures", choices=("closures", "landmarks", "both"))  # edges, planes as variables
     solver: str = setting("incremental", choices=("incremental", "batch"))  # iSAM2, Levenberg-Marquardt
     # A step's error beyond what tracking's residuals show
     odometry_sigma_rad: float = setting(0.0002, 1e-7, 1.0)
     odometry_sigma_m: float = setting(0.0006, 1e-7, 1.0)
     # The map follows when a keyframe has moved or turned by so much
-    least_shift_m: float = setting(0.001, 0.0, 1.0)
-    least_turn_rad: float = setting(0.0003, 0.0, 1.0)
+    least_shift_m: float = setting(0.003, 0.0, 1.0)
+    least_turn_rad: float = setting(0.001, 0.0, 1.0)
     robust: str = setting("cauchy", choices=("none", "huber", "cauchy", "dcs"))  # noise of closures and planes
     robust_sigmas: float = setting(3.0, 0.1, 1000.0)  # beyond which an error counts less
     # A landmark's views count as this much less certain: where the surface strays from its plane, they all err alike
