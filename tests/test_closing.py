@@ -19,6 +19,7 @@ CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 SIZE_M = (2.0, 2.4, 16.0)
 CONFIG = ClosureConfig(
     enabled=True,
+    formulation="landmarks",
     icp_rounds=0,
     odometry_sigma_rad=0.003,
     odometry_sigma_m=0.005,

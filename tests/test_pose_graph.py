@@ -27,6 +27,7 @@ from tgslam.types import RelativePose
 seeds = st.integers(0, 2**32 - 1)
 CORRIDOR = Box((2.0, 2.5, 20.0))
 ROOM = Box((4.0, 2.5, 5.0))
+LANDMARKS = ClosureConfig(formulation="landmarks")
 
 
 def chain(graph: PoseGraph, first: np.ndarray, motions: list[RelativePose]) -> None:
@@ -192,14 +193,14 @@ def test_information_need_not_be_in_the_frame_of_the_earlier_keyframe() -> None:
 @pytest.mark.parametrize("solver", ["incremental", "batch"])
 def test_solvers_agree(solver: str) -> None:
     truth, motions, views = simulated(ROOM, turning, 20, 0)
-    graph = PoseGraph(ClosureConfig(solver=solver, relinearise=1e-4))
+    graph = PoseGraph(ClosureConfig(formulation="landmarks", solver=solver, relinearise=1e-4))
     chain(graph, truth[0], motions)
     for k, seen in enumerate(views):
         for plane_id, plane in seen.items():
             graph.add_plane_observation(k, plane_id, plane)
     found = graph.optimise()
     assert rms_m(found, truth) < 0.02
-    reference = run(ClosureConfig(relinearise=1e-4), truth, motions, views)
+    reference = run(ClosureConfig(formulation="landmarks", relinearise=1e-4), truth, motions, views)
     assert_allclose(found.T_cw, reference.T_cw, atol=2e-3)
     assert_allclose(found.planes, reference.planes, atol=5e-3)
     for plane_id, plane in zip(found.plane_ids, found.planes, strict=True):
@@ -213,7 +214,7 @@ def test_planes_seen_again_straighten_a_corridor(formulation: str) -> None:
     drift, corrected = [], []
     for seed in range(4):
         truth, motions, views = simulated(CORRIDOR, walking, 60, seed)
-        drift.append(rms_m(run(ClosureConfig(), truth, motions, [{}] * 60), truth))
+        drift.append(rms_m(run(LANDMARKS, truth, motions, [{}] * 60), truth))
         corrected.append(rms_m(run(ClosureConfig(formulation=formulation), truth, motions, views), truth))
     assert np.all(np.array(corrected) < drift)
     assert np.sqrt(np.mean(np.square(corrected))) < 0.5 * np.sqrt(np.mean(np.square(drift)))
@@ -227,7 +228,7 @@ def test_a_turning_camera_keeps_what_planes_leave_free(formulation: str, visible
     for seed in range(3):
         truth, motions, views = simulated(ROOM, turning, 40, seed)
         views = [{k: plane for k, plane in seen.items() if k in visible} for seen in views]
-        odometry_only = heights_and_ground(run(ClosureConfig(), truth, motions, [{}] * 40), truth)
+        odometry_only = heights_and_ground(run(LANDMARKS, truth, motions, [{}] * 40), truth)
         found = heights_and_ground(run(ClosureConfig(formulation=formulation), truth, motions, views), truth)
         fixed.append((found[1], odometry_only[1]))
         free.append((found[0], odometry_only[0]))
@@ -272,20 +273,20 @@ def test_a_tenth_of_sightings_wrong() -> None:
     ratios = []
     for seed in range(6):
         truth, motions, views = simulated(CORRIDOR if seed % 2 else ROOM, walking if seed % 2 else turning, 60, seed)
-        clean = rms_m(run(ClosureConfig(), truth, motions, views), truth)
+        clean = rms_m(run(LANDMARKS, truth, motions, views), truth)
         rng = np.random.default_rng(100 + seed)
         spoilt = [
             {k: shifted(p, rng.normal(size=3) * [0.05, 0.05, 0.1]) if rng.random() < 0.1 else p for k, p in v.items()}
             for v in views
         ]
-        ratios.append(rms_m(run(ClosureConfig(), truth, motions, spoilt), truth) / clean)
+        ratios.append(rms_m(run(LANDMARKS, truth, motions, spoilt), truth) / clean)
     assert np.mean(ratios) < 1.2
 
 
 @pytest.mark.parametrize("solver", ["incremental", "batch"])
 def test_planes_that_merge_and_end(solver: str) -> None:
     truth, motions, views = simulated(ROOM, turning, 30, 0)
-    graph = PoseGraph(ClosureConfig(solver=solver))
+    graph = PoseGraph(ClosureConfig(formulation="landmarks", solver=solver))
     chain(graph, truth[0], motions)
     for k, seen in enumerate(views):
         for plane_id, plane in seen.items():
@@ -293,7 +294,7 @@ def test_planes_that_merge_and_end(solver: str) -> None:
     graph.add_plane_observation(3, 99, random_plane(np.random.default_rng(0)))
     graph.optimise()
     graph.replace_planes(dict(enumerate(views)))
-    found, reference = graph.optimise(), run(ClosureConfig(), truth, motions, views)
+    found, reference = graph.optimise(), run(LANDMARKS, truth, motions, views)
     assert found.plane_ids.tolist() == list(range(6))
     assert_allclose(found.T_cw, reference.T_cw, atol=1e-2)
     graph.replace_planes({k: {p: plane for p, plane in seen.items() if p != 5} for k, seen in enumerate(views)})
@@ -329,7 +330,7 @@ def test_odometry_from_several_keyframes_is_weighed() -> None:
 
 @pytest.mark.parametrize("solver", ["incremental", "batch"])
 def test_odometry_that_says_nothing_is_no_singular_system(solver: str) -> None:
-    graph = PoseGraph(ClosureConfig(solver=solver))
+    graph = PoseGraph(ClosureConfig(formulation="landmarks", solver=solver))
     step = se3_exp([0, 0, 0, 0, 0, -1.0])
     chain(graph, np.eye(4), [RelativePose(step, np.zeros((6, 6)))] * 3)
     assert_allclose(graph.optimise().T_cw[3], np.linalg.matrix_power(step, 3), atol=1e-6)
