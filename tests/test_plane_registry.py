@@ -12,7 +12,10 @@ from tests.plane_views import Playback, Rectangle, Stage, looking
 from tgslam.config.schema import PlanesConfig
 from tgslam.geometry import inverse, se3_exp
 from tgslam.planes.estimate import PlaneEstimate, deviation_sigmas, tangent_axes
+from tgslam.planes.instance import PlanarInstance
+from tgslam.planes.joining import Joining
 from tgslam.planes.palette import colours
+from tgslam.planes.sight import Tolerance
 
 CLEAR_M = 0.05  # planes of the scenes that stand closer to a parallel one are not told apart for certain
 WALL = Rectangle((0.0, 3.0, 1.25), (1, 0, 0), (0, 0, 1), (5.0, 2.5))
@@ -419,3 +422,19 @@ def test_the_id_image_is_that_of_the_segments() -> None:
     seen, _ = stage.show(HERE)
     labels = np.array([[0, 1], [-1, 0]], np.int32)
     assert seen.id_image(labels).tolist() == [[seen.ids[0], seen.ids[1]], [-1, seen.ids[0]]]
+
+
+def test_what_a_view_parts_stays_in_the_order_in_which_it_was_found() -> None:
+    """Where extents overlap, the order decides; it must not be that of addresses in memory."""
+    config = PlanesConfig()
+    plane = PlaneEstimate(
+        np.array([0.0, 0.0, -1.0]), np.asarray(2.0), np.array([0.0, 0.0, 2.0]), np.eye(3)[:2], np.eye(3)
+    )
+    joining = Joining(config, Tolerance(config.gate_sigmas, 0.0015, config.pose_sigma_rad, config.pose_sigma_m))
+    owner, others = PlanarInstance(plane, config), [PlanarInstance(plane, config) for _ in range(30)]
+    for other in others:
+        joining.step(owner, other)
+    assert joining.parted_from(owner) == others
+    kept = PlanarInstance(plane, config)
+    joining.replace(owner, kept)
+    assert joining.parted_from(kept) == others

@@ -26,19 +26,20 @@ class Joining:
 
     def __init__(self, config: PlanesConfig, tolerance: Tolerance) -> None:
         self._config, self._tolerance = config, tolerance
-        self._apart: set[frozenset[PlanarInstance]] = set()  # coplanar pairs between which a view looks through
-        self._steps: set[frozenset[PlanarInstance]] = (
-            set()
-        )  # those of them of which one stands a little before the other
+        # Coplanar pairs between which a view looks through, in the order in which they were found: that of a set would
+        # be by address, and differ from run to run
+        self._apart: dict[frozenset[PlanarInstance], None] = {}
+        # Those of them of which one stands a little before the other
+        self._steps: dict[frozenset[PlanarInstance], None] = {}
 
     def part(self, a: PlanarInstance, b: PlanarInstance) -> None:
         """A gap parts two instances in a view."""
-        self._apart.add(frozenset((a, b)))
+        self._apart[frozenset((a, b))] = None
 
     def step(self, a: PlanarInstance, b: PlanarInstance) -> None:
         """A step parts two instances in a view."""
         self.part(a, b)
-        self._steps.add(frozenset((a, b)))
+        self._steps[frozenset((a, b))] = None
 
     def on_step(self, a: PlanarInstance, b: PlanarInstance) -> bool:
         """Whether a step has parted two instances in a view."""
@@ -51,7 +52,7 @@ class Joining:
     def replace(self, absorbed: PlanarInstance, kept: PlanarInstance) -> None:
         """What parts one instance from others parts the one that has absorbed it from them."""
         self._apart, self._steps = (
-            {pair for known in pairs if len(pair := frozenset(kept if i is absorbed else i for i in known)) == 2}
+            {pair: None for known in pairs if len(pair := frozenset(kept if i is absorbed else i for i in known)) == 2}
             for pairs in (self._apart, self._steps)
         )
 
