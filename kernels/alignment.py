@@ -57,8 +57,8 @@ SETTINGS = POSE + 12
 # What a live pixel holds: m, intensity, its gradient and that one's length (G of Eq. 10) in 1/px
 LIVE_DEPTH, LIVE_GREY, LIVE_GX, LIVE_GY, LIVE_STRENGTH = range(5)
 LIVE = 5
-# What a model pixel holds: its surface (a normal in the model camera's frame, 0 = none, then the depth in m), and its
-# intensity with the first and second derivatives by the pixel
+# What a model pixel holds: its surface (a normal in the model camera's frame, 0 = none, then the depth in m, 0 = none,
+# negative at the rim of the map), and its intensity with the first and second derivatives by the pixel
 MODEL_DEPTH = 3
 SURFACE = 4
 GREY, GX, GY, GXX, GXY, GYY = range(6)
@@ -195,7 +195,7 @@ def add_residuals(
     nx,  # the model's surface at the nearest pixel
     ny,
     nz,
-    model_depth,
+    surface_depth,
     near_u,  # that pixel
     near_v,
     model,  # the model's image at the point
@@ -209,7 +209,10 @@ def add_residuals(
 ):
     """Add what live pixels say of Eqs. 12, 13 to a row of sums."""
     gate = gate_at(settings, strength)
+    model_depth = magnitude(surface_depth)
     candidate = seen * indicator(filled(z, 0.0), model_depth)
+    # at the map's rim colours fade into black: a pull that does not depend on the pose
+    firm = indicator(filled(z, 0.0), surface_depth)
     # depth: e is the length of the residual, whose sign is the distance's
     sensor = settings[DEPTH_SIGMA] * depth * depth
     has_normal = indicator(filled(z, 0.5), nx * nx + ny * ny + nz * nz)
@@ -231,13 +234,13 @@ def add_residuals(
     # intensity
     inv_colour = 1.0 / settings[SIGMA_COLOUR]
     e_colour = inv_colour * (model - settings[GAIN] * live - settings[BIAS])
-    robust = matched * irls_weight(e_colour * e_colour)
+    robust = matched * firm * irls_weight(e_colour * e_colour)
     w_colour = robust * (settings[WEIGHT_COLOUR] * inv_colour)
     # its gradient, where there is texture
     inv_gradient = 1.0 / settings[SIGMA_GRADIENT]
     ex = inv_gradient * (gx - settings[GAIN] * live_gx)
     ey = inv_gradient * (gy - settings[GAIN] * live_gy)
-    w_gradient = matched * (1.0 - gate) * irls_weight(ex * ex + ey * ey)
+    w_gradient = matched * firm * (1.0 - gate) * irls_weight(ex * ex + ey * ey)
     w_gradient *= settings[WEIGHT_GRADIENT] * inv_gradient
     # sums of w j j^T and w e j over both, j the derivative by the position in the model's image, then by the point
     inv_z = 1.0 / larger(z, filled(z, _NEAR_M))

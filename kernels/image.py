@@ -18,6 +18,7 @@ from tgslam.kernels.alignment import (
     LIVE_GX,
     LIVE_GY,
     LIVE_STRENGTH,
+    MODEL_DEPTH,
 )
 from tgslam.kernels.simd import LANES
 
@@ -115,8 +116,12 @@ def reduce_rendering(
     relative: ti.f32,
     grey: F2,  # [H // size, W // size] out
     reduced: F2,  # [H // size, W // size] m, out
+    cover: F2,  # [H // size, W // size] mean opacity, out
 ):
-    """Luminance and depth of a rendering, as it is or halved. Colours are fitted over black, and are not divided."""
+    """Luminance, depth and opacity of a rendering, as it is or halved.
+
+    Colours are fitted over black, and are not divided.
+    """
     for s in range(grey.shape[0] * SPLIT):
         i, begin, end = segment(s, grey.shape[1])
         for j in range(begin, end):
@@ -125,6 +130,7 @@ def reduce_rendering(
             for k in ti.static(range(z.n)):
                 z[k] = ti.select(covered[k] > min_opacity, z[k] / ti.max(covered[k], min_opacity), 0.0)
             reduced[i, j] = mean_of_nearest(z, relative)
+            cover[i, j] = covered.sum() * (1.0 / (size * size))
 
 
 @ti.kernel
@@ -279,6 +285,33 @@ def pack_second_derivatives(
             texture[i, j, GXY] = 0.125 * (a + b + 2.0 * (texture[down, j, GX] - texture[up, j, GX]))
             c, d = texture[down, right, GY] - texture[up, left, GY], texture[down, left, GY] - texture[up, right, GY]
             texture[i, j, GYY] = 0.125 * (c + d + 2.0 * (texture[down, j, GY] - texture[up, j, GY]))
+
+
+@ti.func
+def mean_around(image: ti.template(), i, j):
+    """Mean of the pixel and those beside it."""
+    up, down = ti.max(i - 1, 0), ti.min(i + 1, image.shape[0] - 1)
+    left, right = ti.max(j - 1, 0), ti.min(j + 1, image.shape[1] - 1)
+    total = image[up, left] + image[up, j] + image[up, right]
+    total += image[i, left] + image[i, j] + image[i, right]
+    total += image[down, left] + image[down, j] + image[down, right]
+    return total * (1.0 / 9.0)
+
+
+@ti.kernel
+def mark_rims(
+    half_cover: F2,  # [H // 2, W // 2] opacity
+    whole: ti.f32,  # opacity of what is no rim
+    surface: F3,  # [H, W, SURFACE]
+):
+    """Negative depth where the 3x3 blocks of 2x2 pixels round a pixel are covered less than that in the mean."""
+    for s in range(surface.shape[0] * SPLIT):
+        i, begin, end = segment(s, surface.shape[1])
+        row = ti.min(i // 2, half_cover.shape[0] - 1)
+        for j in range(begin, end):
+            column = ti.min(j // 2, half_cover.shape[1] - 1)
+            if mean_around(half_cover, row, column) < whole:
+                surface[i, j, MODEL_DEPTH] = -surface[i, j, MODEL_DEPTH]
 
 
 @ti.kernel

@@ -28,7 +28,7 @@ def rounded(images):
 
 
 def image_pair(height, width, seed=0, holes=0.15):
-    """Noisy slanted surfaces with a step; holes in both depths and among the normals; gates of 1 and below."""
+    """Noisy slanted surfaces with a step; holes in both depths and among the normals; a rim; gates of 1 and below."""
     rng = np.random.default_rng(seed)
     v, u = np.mgrid[:height, :width]
     depth = 2.0 + 0.01 * u - 0.006 * v + 0.3 * (u > 0.7 * width)
@@ -46,6 +46,7 @@ def image_pair(height, width, seed=0, holes=0.15):
     live["gx"], live["gy"] = sobel(live_grey)
     live["gate"] = np.where(rng.random(depth.shape) < 0.3, 1.0, rng.random(depth.shape))
     model = {"depth": noisy_depth(), "normal": normal, "grey": model_grey}
+    model["depth"][:, -width // 4 :] *= -1.0  # the map's rim
     model["gx"], model["gy"] = sobel(model_grey)
     model["gxx"], model["gxy"] = sobel(model["gx"])
     model["gyy"] = sobel(model["gy"])[1]
@@ -246,7 +247,7 @@ def test_jacobians_are_the_central_differences_of_the_residuals():
     checked, step = 0, 1e-6
     for v, u in [(5, 6), (12, 15), (17, 9), (11, 20), (8, 26), (19, 28)]:
         p = reference.pixel(settings, T_ML, live, model, u, v)
-        if p is None or p.depth is None:
+        if p is None or p.depth is None or p.colour is None:
             continue
         x = T_ML[:3] @ np.append(reference.back_project(settings, u, v, live["depth"][v, u]), 1.0)
         met = np.floor(reference.project(settings, x) + 0.5).astype(int)

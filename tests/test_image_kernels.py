@@ -5,6 +5,7 @@ import pytest
 
 from tests.reference import image as reference
 from tgslam import images, runtime
+from tgslam.kernels import alignment
 from tgslam.types import Camera
 
 SIZES = [(48, 64), (37, 51), (2, 3), (700, 5)]
@@ -71,9 +72,25 @@ def test_reduced_frames_and_renderings_match_the_twin(rng, size, halved):
     np.testing.assert_allclose(runtime.to_host(grey), luma, atol=1e-6)
     np.testing.assert_allclose(runtime.to_host(small), expected_depth(depth), rtol=1e-6)
     rendering = [runtime.to_device(image) for image in (colour, depth * opacity, opacity)]
-    images.reduce_rendering(*rendering, 0.4, grey, small)
+    cover = runtime.empty(reduced)
+    images.reduce_rendering(*rendering, 0.4, grey, small, cover)
+    mean_opacity = reference.halve(opacity.astype(float)) if halved else opacity
+    np.testing.assert_allclose(runtime.to_host(cover), mean_opacity, atol=1e-6)
     np.testing.assert_allclose(runtime.to_host(grey), luma, atol=1e-6)
     np.testing.assert_allclose(runtime.to_host(small), expected_depth(np.where(opacity > 0.4, depth, 0.0)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_the_rim_of_the_map_has_negative_depth(rng, size):
+    half_cover = rng.uniform(0.6, 1.0, (size[0] // 2, size[1] // 2)).astype(np.float32)
+    surface = rng.random((*size, alignment.SURFACE), np.float32) + 0.5
+    marked = runtime.to_device(surface.copy())
+    images.mark_rims(runtime.to_device(half_cover), 0.8, marked)
+    rim = reference.rim(half_cover.astype(float), 0.8, size)
+    assert rim.any() and (min(size) < 4 or not rim.all())
+    expected = surface.copy()
+    expected[rim, alignment.MODEL_DEPTH] *= -1
+    np.testing.assert_array_equal(runtime.to_host(marked), expected)
 
 
 @pytest.mark.parametrize("size", SIZES)

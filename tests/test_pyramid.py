@@ -70,22 +70,28 @@ def test_without_the_gate_every_strength_counts_as_texture():
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("first", [0, 1, 2])
 def test_levels_of_a_rendering_match_the_twin(size, first):
-    pyramid = ModelPyramid(camera_of(size), first, LEVELS, LOSS, 0.5)
+    pyramid = ModelPyramid(camera_of(size), first, LEVELS, LOSS, 0.5, 0.7)
     for seed in (0, 1):
         colour, depth = view(size, seed)
         opacity = np.random.default_rng(seed).uniform(0.45, 1.0, size).astype(np.float32)
+        opacity[:, : size[1] // 3] **= 0.2  # the rest is the rim of the map, more or less
         arrays = [runtime.to_device(image) for image in (colour, depth * opacity, opacity, colour)]
         levels = pyramid.update(RenderImages(*arrays))
         covered = np.where(opacity > 0.5, depth, 0.0).astype(float)
         expected = pyramid_of(reference.luminance(colour.astype(float)), covered, first)
         for level, (grey, depth_m) in zip(levels, expected, strict=True):
             surface, texture = runtime.to_host(level.surface), runtime.to_host(level.texture)
-            np.testing.assert_allclose(surface[..., alignment.MODEL_DEPTH], depth_m, atol=2e-6)
+            np.testing.assert_allclose(abs(surface[..., alignment.MODEL_DEPTH]), depth_m, atol=2e-6)
+            cover = opacity.astype(float)
+            while cover.shape[0] > grey.shape[0] // 2:
+                cover = reference.halve(cover)
+            rim = reference.rim(cover, 0.7, grey.shape) & (depth_m > 0)
+            np.testing.assert_array_equal(surface[..., alignment.MODEL_DEPTH] < 0, rim)
             gx, gy = reference.sobel(grey)
             (gxx, gxy), (_, gyy) = reference.sobel(gx), reference.sobel(gy)
             np.testing.assert_allclose(texture[..., :6], np.stack([grey, gx, gy, gxx, gxy, gyy], -1), atol=2e-6)
             normal = images.normals(
-                runtime.to_device(surface[..., alignment.MODEL_DEPTH].copy()), level.camera, 1, LOSS.depth_sigma_per_m2
+                runtime.to_device(abs(surface[..., alignment.MODEL_DEPTH])), level.camera, 1, LOSS.depth_sigma_per_m2
             )
             np.testing.assert_array_equal(surface[..., :3], runtime.to_host(normal))
 
@@ -99,6 +105,6 @@ def test_what_is_no_depth_is_none(value):
     pixels = runtime.to_host(level.pixels).swapaxes(2, 3).reshape(*size, alignment.LIVE)
     assert not pixels[10:20, 10:30, alignment.LIVE_DEPTH].any()
     arrays = [runtime.to_device(image) for image in (colour, depth, np.ones(size), colour)]
-    (model,) = ModelPyramid(camera_of(size), 0, 1, LOSS, 0.5).update(RenderImages(*arrays))
+    (model,) = ModelPyramid(camera_of(size), 0, 1, LOSS, 0.5, 0.7).update(RenderImages(*arrays))
     surface = runtime.to_host(model.surface)
     assert not surface[10:20, 10:30, alignment.MODEL_DEPTH].any() and np.isfinite(surface).all()

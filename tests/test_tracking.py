@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from tests.reference import alignment as reference
 from tgslam import runtime
@@ -331,6 +332,27 @@ def test_texture_determines_what_one_plane_leaves_open():
     assert not result.lost and angle_deg < 0.05 and distance_mm < 2.0
 
 
+@dataclass
+class Explored(Planes):
+    """Only what is left of a column is in the map, and fades into black over some pixels, as splats do."""
+
+    def forward(self, gaussians: GaussianMap | None, T_cw: np.ndarray) -> RenderImages:
+        frame = self.frame(T_cw)
+        opacity = np.float32(ndtr((44.0 - np.arange(self.camera.width)) / 2.0)) * np.ones_like(frame.depth_m)
+        colour = frame.colour * opacity[..., None]
+        images = (colour, frame.depth_m * opacity, opacity, np.zeros_like(frame.colour))
+        return RenderImages(*(runtime.to_device(image) for image in images))
+
+
+def test_the_rim_of_the_map_does_not_draw_the_pose():
+    scene = Explored((WALL,), contrast=0.2)
+    off_mm = []
+    for rim_opacity in (0.0, CONFIG.rim_opacity):
+        one = exact_tracker(scene, replace(CONFIG, rim_opacity=rim_opacity))
+        off_mm.append(error(one.track(scene.frame(MOTION), None, np.eye(4), Exposure()).T_cw, inverse(MOTION))[1])
+    assert off_mm[1] < 10.0 < 0.1 * off_mm[0]
+
+
 def live_images(level: LiveLevel) -> dict[str, np.ndarray]:
     """What the kernel is given of a frame, as the twin takes it."""
     pixels = runtime.to_host(level.pixels).swapaxes(2, 3).astype(float)
@@ -356,7 +378,7 @@ def test_the_information_is_how_the_cost_grows_with_the_pose():
     result = exact_tracker(scene, config).track(frame, None, T_mw, Exposure())
     loss = LossConfig()
     live = live_images(LivePyramid(TINY, 0, 1, loss).update(frame)[0])
-    model = model_images(ModelPyramid(TINY, 0, 1, loss, CONFIG.min_opacity).update(scene.forward(None, T_mw))[0])
+    model = model_images(ModelPyramid(TINY, 0, 1, loss, CONFIG.min_opacity, CONFIG.rim_opacity).update(scene.forward(None, T_mw))[0])
     settings = reference.Settings(
         TINY.fx, TINY.fy, TINY.cx, TINY.cy, result.exposure.gain, result.exposure.bias,
         loss.depth_sigma_per_m2, CONFIG.max_distance_sigmas, loss.charbonnier_depth_sigmas, loss.gate_depth_boost,

@@ -31,7 +31,7 @@ def luminance(colour: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
 
 def halve(image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
     """Mean of each 2x2 block of float32 [H, W] or [H, W, 3] -> [H // 2, W // 2(, 3)]; see `Camera.halved`."""
-    size = _halved(image.shape)
+    size = halved(image.shape)
     if len(image.shape) == 2:
         require("image", image, (None, None))
         out = _output(out, size)
@@ -56,21 +56,34 @@ def reduce_rendering(
     min_opacity: float,
     grey: np.ndarray,
     reduced_m: np.ndarray,
+    cover: np.ndarray,
 ) -> None:
-    """Write luminance and depth of a rendering (depth accumulated) into images of its size or of half of it.
+    """Write luminance, depth and opacity of a rendering (depth accumulated) into images of its size or of half of it.
 
     Pixels of no more than min_opacity have no depth. Colours are fitted to be seen over black and are not divided.
     """
     size = _reduction(colour, depth, grey, reduced_m)
     require("opacity", opacity, depth.shape)
-    kernels.reduce_rendering(colour, depth, opacity, min_opacity, size, DEPTH_EDGE, grey, reduced_m)
+    require("cover", cover, grey.shape)
+    kernels.reduce_rendering(colour, depth, opacity, min_opacity, size, DEPTH_EDGE, grey, reduced_m, cover)
+
+
+def mark_rims(half_cover: np.ndarray, whole: float, surface: np.ndarray) -> None:
+    """Make the depth of surface [H, W, SURFACE] negative at the map's rim.
+
+    That is where the rendering's opacity, halved [H // 2, W // 2], is below `whole` in the mean over some 6 x 6 pixels:
+    gaps between Gaussians are narrower.
+    """
+    require("surface", surface, (None, None, alignment.SURFACE))
+    require("half_cover", half_cover, halved(surface.shape))
+    kernels.mark_rims(half_cover, whole, surface)
 
 
 def halve_pair(grey: np.ndarray, depth_m: np.ndarray, half_grey: np.ndarray, half_m: np.ndarray) -> None:
     """`halve` and `halve_depth` of images [H, W] in one pass."""
     require("grey", grey, (None, None))
     require("depth_m", depth_m, grey.shape)
-    require("half_grey", half_grey, _halved(grey.shape))
+    require("half_grey", half_grey, halved(grey.shape))
     require("half_m", half_m, half_grey.shape)
     kernels.halve_pair(grey, depth_m, DEPTH_EDGE, half_grey, half_m)
 
@@ -82,7 +95,7 @@ def halve_depth(depth_m: np.ndarray, relative: float = DEPTH_EDGE, out: np.ndarr
     a block without measurements gives 0.
     """
     require("depth_m", depth_m, (None, None))
-    out = _output(out, _halved(depth_m.shape))
+    out = _output(out, halved(depth_m.shape))
     kernels.halve_depth(depth_m, relative, out)
     return out
 
@@ -161,7 +174,7 @@ class PlaneFits:
     def __init__(self, camera: Camera, radius: int, sigma_per_m2: float, steepest_rad: float = STEEPEST_RAD) -> None:
         if not 1 <= radius <= fitting.MARGIN:
             raise ValueError(f"radius must be from 1 to {fitting.MARGIN} blocks, but is {radius}")
-        height, width = _halved((camera.height, camera.width))
+        height, width = halved((camera.height, camera.width))
         vectors = -(-width // fitting.LANES)
         self.camera, self._radius = camera, radius
         self._settings = runtime.to_device(
@@ -202,7 +215,8 @@ def _reduction(colour: np.ndarray, depth: np.ndarray, grey: np.ndarray, reduced:
     return size
 
 
-def _halved(shape: tuple[int, ...]) -> tuple[int, int]:
+def halved(shape: tuple[int, ...]) -> tuple[int, int]:
+    """(height, width) of an image that begins with those, halved. Raises ValueError where nothing would be left."""
     height, width = shape[0] // 2, shape[1] // 2
     if not (height and width):
         raise ValueError(f"an image of {list(shape[:2])} pixels cannot be halved")

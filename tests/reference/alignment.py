@@ -49,7 +49,7 @@ class Term:
 
 @dataclass
 class Pixel:
-    """What one live pixel says; depth and gradient are None where they do not apply."""
+    """What one live pixel says; the terms are None where they do not apply."""
 
     matched: bool
     depth: Term | None = None
@@ -58,6 +58,7 @@ class Pixel:
     live: float = 0.0
     model: float = 0.0
     sensor_sigmas: float = 0.0  # of the depth residual, where there is one
+    colour_sigmas: float = 0.0  # of the intensity residual
 
 
 def bilinear(image, u, v):
@@ -90,8 +91,8 @@ def pixel(s, T_ml, live, model, u, v):
     if um < 1 or vm < 1 or um >= width - 2 or vm >= height - 2:
         return None
     un, vn = int(np.floor(um + 0.5)), int(np.floor(vm + 0.5))
-    zm = model["depth"][vn, un]
-    if zm <= 0:
+    rim, zm = model["depth"][vn, un] < 0, abs(model["depth"][vn, un])
+    if zm == 0:
         return None
     n = model["normal"][vn, un]
     distance, cosine = n @ (x - back_project(s, un, vn, zm)), max(-n @ ray / np.linalg.norm(ray), MIN_COSINE)
@@ -110,6 +111,9 @@ def pixel(s, T_ml, live, model, u, v):
         result.depth = Term(np.array([distance * scale]), scale * (n @ moves)[None], weight, s.charbonnier_depth)
     slope = np.array([bilinear(model[name], um, vm) for name in ("gx", "gy")])
     e = np.array([result.model - s.gain * result.live - s.bias])
+    result.colour_sigmas = abs(e[0]) / s.sigma_colour
+    if rim:
+        return result
     result.colour = Term(e / s.sigma_colour, (slope @ shifts)[None] / s.sigma_colour, s.weight_colour)
     if gate < 1:
         gxx, gxy, gyy = (bilinear(model[name], um, vm) for name in ("gxx", "gxy", "gyy"))
@@ -143,7 +147,8 @@ def normal_equations(s, T_ml, live, model):
         A += t.weight * t.robust * t.jacobian.T @ t.jacobian
         b += t.weight * t.robust * t.jacobian.T @ t.e
     depth = np.array([p.sensor_sigmas for p in matched if p.depth is not None])
-    w, m, n = np.array([(p.colour.robust, p.live, p.model) for p in matched]).reshape(-1, 3).T
+    firm = [p for p in matched if p.colour is not None]
+    w, m, n = np.array([(p.colour.robust, p.live, p.model) for p in firm]).reshape(-1, 3).T
     return {
         "A": A,
         "b": b,
@@ -151,6 +156,6 @@ def normal_equations(s, T_ml, live, model):
         "matched": len(matched),
         "inliers": (depth < INLIER_SIGMAS).sum(),
         "depth_sum": depth.sum(),
-        "colour_sum": sum(abs(p.colour.e[0]) for p in matched),
+        "colour_sum": sum(p.colour_sigmas for p in matched),
         "moments": np.array([w.sum(), w @ m, w @ n, w @ m**2, w @ (m * n)]),
     }

@@ -87,3 +87,17 @@ def _fit(blocks, i, j, radius, sigma, slope):
     if solution[0] <= 0 or residual > 4 * sigma**2 + 1e-5 * solution[0] ** 2:
         return None
     return solution[0], solution[1] / 2, solution[2] / 2
+
+
+def mean_around(image):
+    """Mean of 3x3 pixels, borders repeated."""
+    p = np.pad(image, 1, mode="edge")
+    rows = p[:-2] + p[1:-1] + p[2:]
+    return (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) / 9
+
+
+def rim(half_cover, whole, shape):
+    """Where an image [H, W] of that shape is covered less than `whole` in the mean over 3x3 blocks of 2x2 pixels."""
+    rows = np.minimum(np.arange(shape[0]) // 2, half_cover.shape[0] - 1)
+    columns = np.minimum(np.arange(shape[1]) // 2, half_cover.shape[1] - 1)
+    return (mean_around(half_cover) < whole)[np.ix_(rows, columns)]

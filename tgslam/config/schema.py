@@ -96,6 +96,7 @@ class TrackingConfig:
     max_distance_sigmas: float = setting(15.0, 1.0, 1000.0)  # depth residuals beyond are no match
     exposure: str = setting("gain", choices=("none", "gain", "gain_bias"))  # a frame's brightness against the map
     min_opacity: float = setting(0.8, 0.0, 1.0)  # model pixels less covered are not used
+    rim_opacity: float = setting(0.93, 0.0, 1.0)  # nor those round which the map covers less than that in the mean
     first_order_iterations: tuple[int, ...] = setting((20, 20), 1, 1000, min_items=1)  # Adam steps, likewise
     first_order_rate: float = setting(0.002, 1e-6, 1.0)  # Adam step, rad and m
     lost_inlier_ratio: float = setting(0.3, 0.0, 1.0)  # fewer matched pixels with a residual below 3 sigma: lost

@@ -31,7 +31,7 @@ class GaussNewtonTracker:
         self.rasterizer = Rasterizer(camera)
         first, levels = finest_level(camera, config.finest_width_px), len(config.iterations)
         self._live_pyramid = LivePyramid(camera, first, levels, loss)
-        self._model_pyramid = ModelPyramid(camera, first, levels, loss, config.min_opacity)
+        self._model_pyramid = ModelPyramid(camera, first, levels, loss, config.min_opacity, config.rim_opacity)
         self._linearise = [Lineariser(level.camera, config, loss) for level in self._live_pyramid.levels]
 
     def track(

@@ -5,6 +5,7 @@ The memory is taken once and written anew for each frame.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,22 +75,31 @@ class LivePyramid:
 class ModelPyramid:
     """Levels of a rendering of the map, finest first, of the same sizes as those of `LivePyramid`."""
 
-    def __init__(self, camera: Camera, first: int, levels: int, loss: LossConfig, min_opacity: float) -> None:
-        """min_opacity: pixels that the map covers no more than that are left out."""
-        self.min_opacity, self._images = min_opacity, _ImagePyramid(camera, first, levels)
+    def __init__(self, camera: Camera, first: int, levels: int, loss: LossConfig, min_opacity: float, rim_opacity: float) -> None:
+        """min_opacity: pixels that the map covers no more than that are left out.
+
+        rim_opacity: and those round which it covers less than that in the mean are marked as its rim.
+        """
+        self.min_opacity, self._rim_opacity, self._images = min_opacity, rim_opacity, _ImagePyramid(camera, first, levels)
         self.levels = [_model_level(camera.halved(first + level)) for level in range(levels)]
+        sizes = [pair.grey.shape for pair in self._images.pairs]
+        self._covers = [runtime.empty(size) for size in (*sizes, images.halved(sizes[-1]))]
         self._fits = [images.PlaneFits(level.camera, _NORMAL_RADIUS, loss.depth_sigma_per_m2) for level in self.levels]
 
     def update(self, rendered: RenderImages) -> list[ModelLevel]:
         """Take in a rendering at full size; the result is valid until the next one."""
         base = self._images.base
         images.reduce_rendering(
-            rendered.colour, rendered.depth, rendered.opacity, self.min_opacity, base.grey, base.depth
+            rendered.colour, rendered.depth, rendered.opacity, self.min_opacity, base.grey, base.depth, self._covers[0]
         )
-        for level, pair, fits in zip(self.levels, self._images.halvings(), self._fits, strict=True):
+        for cover, half in itertools.pairwise(self._covers):
+            images.halve(cover, half)
+        half_covers = self._covers[-len(self.levels) :]
+        for level, pair, fits, cover in zip(self.levels, self._images.halvings(), self._fits, half_covers, strict=True):
             kernels.pack_texture(pair.grey, level.texture)
             kernels.pack_second_derivatives(level.texture)
             fits.write(pair.depth, level.surface)
+            images.mark_rims(cover, self._rim_opacity, level.surface)
         return self.levels
 
 
@@ -109,19 +119,19 @@ class _ImagePyramid:
     """Luminance and depth at each resolution from `base` down, which is half the camera's unless `first` is 0."""
 
     def __init__(self, camera: Camera, first: int, levels: int) -> None:
-        self._skipped = max(first - 1, 0)  # halvings before the finest level that the base does not save
-        self._pairs = [_Pair.empty(camera.halved(level)) for level in range(min(first, 1), first + levels)]
+        self._levels = levels
+        self.pairs = [_Pair.empty(camera.halved(level)) for level in range(min(first, 1), first + levels)]
 
     @property
     def base(self) -> _Pair:
         """To be filled with the frame before `halvings`."""
-        return self._pairs[0]
+        return self.pairs[0]
 
     def halvings(self) -> list[_Pair]:
         """Halve the base again and again; returns the levels that alignment uses, finest first."""
-        for pair, half in zip(self._pairs, self._pairs[1:], strict=False):
+        for pair, half in itertools.pairwise(self.pairs):
             images.halve_pair(pair.grey, pair.depth, half.grey, half.depth)
-        return self._pairs[self._skipped :]
+        return self.pairs[-self._levels :]
 
 
 def _live_level(camera: Camera) -> LiveLevel:

@@ -17,6 +17,7 @@ from tgslam.types import Camera, Frame
 
 _LOSS = LossConfig()
 _MIN_OPACITY = 0.5
+_RIM_OPACITY = 0.9
 
 
 def _view(height: int, width: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -45,7 +46,7 @@ def levels(height: int = 37, width: int = 50, first: int = 1) -> dict[str, np.nd
     """Everything that alignment reads, at two resolutions."""
     camera = _camera(height, width)
     live = LivePyramid(camera, first, 2, _LOSS).update(Frame(0, 0.0, *_view(height, width, seed=0)))
-    model = ModelPyramid(camera, first, 2, _LOSS, _MIN_OPACITY).update(_rendering(height, width))
+    model = ModelPyramid(camera, first, 2, _LOSS, _MIN_OPACITY, _RIM_OPACITY).update(_rendering(height, width))
     result = {}
     for k in range(2):
         result[f"gate_{k}"] = np.array([live[k].gate_low, live[k].gate_inverse_range])
@@ -60,7 +61,7 @@ def normal_equations(height: int = 37, width: int = 50) -> dict[str, np.ndarray]
     """The equations at a pose and an exposure off the true ones."""
     camera = _camera(height, width)
     (live,) = LivePyramid(camera, 0, 1, _LOSS).update(Frame(0, 0.0, *_view(height, width, seed=0)))
-    (model,) = ModelPyramid(camera, 0, 1, _LOSS, _MIN_OPACITY).update(_rendering(height, width))
+    (model,) = ModelPyramid(camera, 0, 1, _LOSS, _MIN_OPACITY, _RIM_OPACITY).update(_rendering(height, width))
     T_ml = se3_exp([0.02, -0.03, 0.015, 0.02, -0.015, 0.03])
     found = Lineariser(camera, TrackingConfig(), _LOSS)(live, model, T_ml, Exposure(1.1, -0.04))
     intensity = found.intensity
