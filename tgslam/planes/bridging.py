@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from tgslam.plane_fit import CellGrid, Floats, Labels
 from tgslam.planes.merging import Agreement, Indices
-from tgslam.planes.moments import joining_cost, planes_of, squared_residuals
+from tgslam.planes.moments import Joints, planes_of
 
 _SIGMAS = 3.0  # beyond which a measurement lies before or behind a plane
 _RUN = 2  # samples one after the other off the plane: one alone is a border's ragged pixel
@@ -69,8 +69,8 @@ def bridge(
 def _compare(cost: Floats, moments: Floats, piece: int, others: Indices, agreement: Agreement) -> None:
     """Write what joining a piece to others costs, above the diagonal of `cost` [G, G]; infinite where they disagree."""
     pairs = np.stack([np.minimum(piece, others), np.maximum(piece, others)])
-    found = joining_cost(moments, squared_residuals(moments), *pairs)
-    cost[tuple(pairs)] = np.where(agreement.admits(found, moments[pairs[0]], moments[pairs[1]]), found, np.inf)
+    joints = Joints.of(moments, *pairs)
+    cost[tuple(pairs)] = np.where(agreement.admits(joints), joints.cost, np.inf)
 
 
 def _area_m2(moments: Floats, plane: Floats, grid: CellGrid) -> Floats:

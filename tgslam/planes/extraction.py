@@ -14,7 +14,7 @@ from tgslam.planes.bridging import Pieces, bridge
 from tgslam.planes.cells import CellGraph, planar_cells
 from tgslam.planes.layers import bordering, group_moments, parallel, part_layers, settle
 from tgslam.planes.merging import Agreement, Indices, agglomerate
-from tgslam.planes.moments import NOISE, joining_cost, noise_of, planes_of, squared_residuals, width_px
+from tgslam.planes.moments import NOISE, noise_of, planes_of, squared_residuals, width_px
 from tgslam.planes.segment import PlaneSegment, PlaneView
 from tgslam.planes.statistics import Evidence, evidence, refined, totals
 from tgslam.types import Camera
@@ -92,9 +92,7 @@ def _numbered(graph: CellGraph, group: Indices, grid: CellGrid, least_px: float)
 
 def _continuous(graph: CellGraph, agreement: Agreement) -> Indices:
     """[E, 2] those edges of the graph across which the surface has no step."""
-    first, second = graph.edges.T
-    cost = joining_cost(graph.moments, squared_residuals(graph.moments), first, second)
-    return graph.edges[agreement.admits(cost, graph.moments[first], graph.moments[second])]
+    return graph.edges[agreement.admits(graph.joints)]
 
 
 def _evidence(

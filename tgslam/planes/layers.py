@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from tgslam.plane_fit import Floats, Labels
 from tgslam.planes.cells import CellGraph
 from tgslam.planes.merging import Agreement, Indices
-from tgslam.planes.moments import NOISE, information, joining_cost, planes_of, squared_residuals, width_px
+from tgslam.planes.moments import NOISE, Joints, information, planes_of, summed, width_px
 
 _WINDOW_CELLS = 3  # over which misfits are averaged
 _OFF_SIGMAS = 2.5  # of such means: beyond it a cell stands off
@@ -140,8 +140,8 @@ def _connected(graph: CellGraph, shape: tuple[int, int], group: Indices) -> Indi
 
 def group_moments(graph: CellGraph, group: Indices) -> Floats:
     """[G, 11] of the groups 0 .. G - 1, and an empty one after them that stands for -1."""
-    moments = np.zeros((int(group.max(initial=-1)) + 2, graph.moments.shape[1]))
-    np.add.at(moments, group, graph.moments)
+    count = int(group.max(initial=-1)) + 2
+    moments = summed(graph.moments, np.where(group < 0, count - 1, group), count)
     moments[-1] = 0.0
     return moments
 
@@ -185,8 +185,7 @@ def _standing_off(misfit: Floats, cell: Indices, shape: tuple[int, int]) -> list
 
 def _agree(pair: Floats, agreement: Agreement) -> bool:
     """Whether one plane may serve the two sets with moments [2, 11]."""
-    cost = joining_cost(pair, squared_residuals(pair), np.array([0]), np.array([1]))
-    return bool(agreement.admits(cost, pair[:1], pair[1:])[0])
+    return bool(agreement.admits(Joints.of(pair, np.array([0]), np.array([1])))[0])
 
 
 def _shifted(grid: Indices, side: tuple[int, int]) -> Indices:

@@ -6,6 +6,8 @@ Moments [N, 10] and planes [N, 3] are those of `tgslam.plane_fit`: inverse depth
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,14 +52,30 @@ def scatter(moments: Floats) -> Floats:
     return np.array([[xx - x * x / n, xy - x * y / n], [xy - x * y / n, yy - y * y / n]]) / n
 
 
-def joining_cost(moments: Floats, squares: Floats, first: NDArray[np.intp], second: NDArray[np.intp]) -> Floats:
-    """[E] 1/m^2: by how much the squared residuals of sets `first` and `second` [E] grow if one plane serves both.
+def summed(rows: Floats, group: NDArray[np.intp], groups: int) -> Floats:
+    """[groups, K] sums of the rows [N, K] that belong to each group [N], added in their order."""
+    return np.stack([np.bincount(group, column, groups) for column in rows.T], axis=1)
 
-    It is d^T (P_1 + P_2)^-1 d, d the difference of the two planes and P their covariances at unit noise. squares:
-    `squared_residuals` of the moments.
-    """
-    joint = squared_residuals(moments[first] + moments[second])
-    return np.maximum(joint - squares[first] - squares[second], 0.0)
+
+@dataclass(frozen=True)
+class Joints:
+    """Pairs of sets of points, each held against one plane for both of its sets."""
+
+    moments: Floats  # [E, 11] of both together
+    fewer: Floats  # [E] points of the smaller set
+    cost: Floats  # [E] 1/m^2, by how much the squared residuals grow if one plane serves both
+
+    @classmethod
+    def of(cls, moments: Floats, first: NDArray[np.intp], second: NDArray[np.intp]) -> Joints:
+        """Of the sets `first` and `second` [E] out of those with these moments [N, 11].
+
+        The cost is d^T (P_1 + P_2)^-1 d, d the difference of the two planes and P their covariances at unit noise.
+        """
+        squares, size = squared_residuals(moments), moments[:, 0]
+        both = moments.take(first, axis=0)
+        both += moments.take(second, axis=0)
+        cost = np.maximum(squared_residuals(both) - squares[first] - squares[second], 0.0)
+        return cls(both, np.minimum(size[first], size[second]), cost)
 
 
 def _fitted(moments: Floats) -> tuple[Floats, Floats, Floats]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tgslam.plane_fit import CellGrid, Floats, SegmentSums
-from tgslam.planes.moments import information, planes_of, scatter, width_px
+from tgslam.planes.moments import information, planes_of, scatter, summed, width_px
 from tgslam.planes.segment import PlaneSegment, tangents
 
 _CLUSTER_CELLS = 4  # side of the squares of cells within which noise may be correlated
@@ -28,9 +28,7 @@ class Evidence:
 
 def totals(sums: SegmentSums, planes: int) -> Floats:
     """[P, 10] moments of each plane's misfits."""
-    result = np.zeros((planes, sums.moments.shape[1]))
-    np.add.at(result, sums.plane, sums.moments)
-    return result
+    return summed(sums.moments, sums.plane, planes)
 
 
 def refined(planes: Floats, sums: SegmentSums) -> Floats:
