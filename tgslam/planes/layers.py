@@ -88,26 +88,27 @@ def parallel(
     one that is parallel to it, and the pairs (smaller, larger) that a step parts: more of it than the sensor may feign
     or a surface may have.
     """
-    aligned: dict[int, int] = {}
-    result, stepped = planes.copy(), []
     size_px = moments[:, 0]
     beside = (size_px[pairs[:, 1]] >= _LARGER * size_px[pairs[:, 0]]) & (size_px[pairs[:, 0]] >= _FEWEST_PX)
-    for small, large in pairs[beside]:
-        weight, reference = information(moments[small]), planes[large]
-        size = float(reference @ weight @ reference)
-        scale = float(reference @ weight @ planes[small]) / size
-        depth_m = moments[small, 0] / max(float(weight[0] @ planes[small]), 1e-9)
-        rest = planes[small] - scale * reference
-        noise = agreement.sigmas**2 * moments[small, NOISE] / moments[small, 0] + agreement.common
-        shift = (agreement.shift_m / depth_m**2) ** 2 * moments[small, 0]
-        allowed = noise + shift if width_px(moments[small]) <= _NARROW_CELLS * cell_px else noise
-        if abs(scale - 1.0) * depth_m <= _STEP_M and float(rest @ weight @ rest) <= allowed:
-            result[small] = scale * reference
-            aligned[int(small)] = int(large)
-            bent = (agreement.shift_sigmas * agreement.sigma) ** 2 * moments[small, 0]
-            if (scale - 1.0) ** 2 * size > noise + shift + bent:
-                stepped.append((int(small), int(large)))
-    return result, aligned, stepped
+    small, large = pairs[beside].T
+    count, own, reference = size_px[small], planes[small], planes[large]
+    weight = information(moments[small])
+    weighted = np.einsum("kij,kj->ki", weight, reference)
+    size = np.sum(reference * weighted, axis=1)
+    scale = np.sum(own * weighted, axis=1) / size
+    depth_m = count / np.maximum(np.sum(weight[:, 0] * own, axis=1), 1e-9)
+    rest = own - scale[:, None] * reference
+    noise = agreement.sigmas**2 * moments[small, NOISE] / count + agreement.common
+    shift = (agreement.shift_m / depth_m**2) ** 2 * count
+    allowed = noise + np.where(width_px(moments[small]) <= _NARROW_CELLS * cell_px, shift, 0.0)
+    level = np.einsum("ki,kij,kj->k", rest, weight, rest) <= allowed
+    level &= np.abs(scale - 1.0) * depth_m <= _STEP_M
+    bent = (agreement.shift_sigmas * agreement.sigma) ** 2 * count
+    step = level & ((scale - 1.0) ** 2 * size > noise + shift + bent)
+    result = planes.copy()
+    result[small[level]] = scale[level, None] * reference[level]
+    aligned = dict(zip(small[level].tolist(), large[level].tolist(), strict=True))
+    return result, aligned, list(zip(small[step].tolist(), large[step].tolist(), strict=True))
 
 
 def bordering(labels: Labels) -> Indices:

@@ -31,9 +31,8 @@ def planes_of(moments: Floats) -> Floats:
 
 
 def information(moments: Floats) -> Floats:
-    """[3, 3] normal matrix over (g0, gx, gy) of one set's moments [10]."""
-    n, x, y, xx, xy, yy = moments[:6]
-    return np.array([[n, x, y], [x, xx, xy], [y, xy, yy]])
+    """[N, 3, 3] normal matrices over (g0, gx, gy)."""
+    return moments[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
 
 
 def noise_of(moments: Floats) -> Floats:
@@ -41,15 +40,19 @@ def noise_of(moments: Floats) -> Floats:
     return np.sqrt(moments[:, NOISE] / np.maximum(moments[:, 0], 1.0))
 
 
-def width_px(moments: Floats) -> float:
-    """Of a rectangle that scatters like the points, the shorter side, in px."""
-    return float(np.sqrt(12.0 * max(np.linalg.eigvalsh(scatter(moments))[0], 0.0)))
+def width_px(moments: Floats) -> Floats:
+    """[N] of rectangles that scatter like the points, the shorter side, in px."""
+    xx, xy, _, yy = scatter(moments).reshape(-1, 4).T
+    least = 0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy)
+    return np.sqrt(12.0 * np.maximum(least, 0.0))
 
 
 def scatter(moments: Floats) -> Floats:
-    """[2, 2] px^2, covariance of the points' places in the image."""
-    n, x, y, xx, xy, yy = moments[:6]
-    return np.array([[xx - x * x / n, xy - x * y / n], [xy - x * y / n, yy - y * y / n]]) / n
+    """[N, 2, 2] px^2, covariances of the points' places in the image."""
+    n, x, y, xx, xy, yy = moments.T[:6]
+    mean_x, mean_y = x / n, y / n
+    across = xy - mean_x * y
+    return (np.stack([xx - mean_x * x, across, across, yy - mean_y * y], axis=1) / n[:, None]).reshape(-1, 2, 2)
 
 
 def summed(rows: Floats, group: NDArray[np.intp], groups: int) -> Floats:
