@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-
 from numpy.typing import NDArray
 
 from tgslam.plane_fit import CellGrid, Floats, SegmentSums
@@ -104,7 +103,7 @@ class _Rows:
     @classmethod
     def of(cls, sums: SegmentSums, planes: Floats, change: Floats, fewest_px: float) -> _Rows:
         """Of the planes that have enough pixels, in more than a line."""
-        moments, pixels = totals(sums, len(planes)), np.bincount(sums.plane, sums.pixels, len(planes))
+        moments, pixels = totals(sums, len(planes)), summed(sums.pixels[:, None], sums.plane, len(planes))[:, 0]
         index = np.flatnonzero(pixels >= fewest_px)
         index = index[width_px(moments[index]) >= _LEAST_WIDTH_PX]
         number = np.full(len(planes), -1)
@@ -215,7 +214,7 @@ def _bends(rows: _Rows) -> tuple[Floats, Floats]:
 
 
 def _curvatures(hessian: Floats, fit: _Fit, grid: CellGrid) -> Floats:
-    """[C] the larger principal curvature, 1/m, of surfaces whose inverse depth has these second derivatives [C, 2, 2]."""
+    """[C] the larger principal curvature, 1/m, of surfaces with these second derivatives [C, 2, 2] of inverse depth."""
     focal = np.array([grid.camera.fx, grid.camera.fy])
     z = fit.centroid[:, 2, None, None]
     slope = fit.normal[:, :2] / np.sum(fit.normal * fit.centroid, axis=1)[:, None]  # of 1/z, per unit of x/z and y/z
