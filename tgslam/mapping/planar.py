@@ -112,7 +112,8 @@ class PlanarMapping:
         if shown:
             extents = self._extents(keyframe.depth_m(), keyframe.T_cw)
             ids = self._divided(keyframe.plane_ids.astype(np.int32), shown, extents)
-            keyframe.plane_ids = ids.astype(np.int16)
+            if not np.array_equal(ids, keyframe.plane_ids):
+                keyframe.plane_ids = ids.astype(np.int16)
 
     def _complete(self, keyframe: Keyframe, plane_ids: Sequence[int]) -> None:
         """A keyframe may show PGIs that only later ones have confirmed."""
