@@ -99,11 +99,12 @@ class PixelLabels:
             self._depth_m, *self._where, self._found, runtime.to_device(planes), self._labels, scale, out
         )
         found, values = runtime.to_host(self._found), runtime.to_host(out)
-        cell, slot = np.nonzero(values[:, :, kernels.RAW_COUNT] > 0)
-        rows = values[cell, slot].astype(np.float64)
+        values = values.reshape(-1, kernels.SEGMENT_SUMS)
+        shared = np.flatnonzero(values[:, kernels.RAW_COUNT] > 0)
+        rows, cell = values[shared].astype(np.float64), shared // kernels.CANDIDATES
         moments = moved(rows[:, : kernels.MOMENTS], grid.centres()[cell], np.zeros(len(cell)))
         return SegmentSums(
-            found[cell, slot].astype(np.intp),
+            found.ravel()[shared].astype(np.intp),
             cell,
             moments,
             rows[:, kernels.RAW_COUNT],

@@ -16,7 +16,7 @@ from tgslam.planes.layers import bordering, group_moments, parallel, part_layers
 from tgslam.planes.merging import Agreement, Indices, agglomerate
 from tgslam.planes.moments import NOISE, noise_of, planes_of, squared_residuals
 from tgslam.planes.segment import PlaneSegment, PlaneView
-from tgslam.planes.statistics import Evidence, evidence, refined, totals
+from tgslam.planes.statistics import Evidence, evidence, totals
 from tgslam.types import Camera
 
 _ROBUST_ROUNDS = 2
@@ -51,14 +51,14 @@ def extract_planes(depth_m: np.ndarray, camera: Camera, config: PlanesConfig, si
         sums = pixels.sums(before, _CHARBONNIER_SIGMAS * sigma_per_m2)
         moments = np.column_stack([totals(sums, len(before)), noise**2])
         moments[:, NOISE] *= moments[:, 0]
-        planes, aligned, stepped = parallel(refined(before, sums), moments, pairs, agreement, grid.cell_px)
+        planes, aligned, stepped = parallel(before + planes_of(moments), moments, pairs, agreement, grid.cell_px)
     fewest_px = max(config.min_area_share * camera.width * camera.height, _FEWEST_PX)
     seen = evidence(planes, planes - before, sums, grid, sigma_per_m2, fewest_px)
     found = _with_alignment(_judged(seen, noise / sigma_per_m2, grid, config), aligned)
     number = np.full(len(planes) + 1, -1, np.int32)
     number[[index for index, _ in found]] = np.arange(len(found))
     steps = frozenset((int(number[i]), int(number[j])) for i, j in stepped if number[i] >= 0 and number[j] >= 0)
-    return PlaneView(number[pixels.read()], tuple(segment for _, segment in found), steps)
+    return PlaneView(number.take(pixels.read()), tuple(segment for _, segment in found), steps)
 
 
 def _pieces(depth_m: np.ndarray, grid: CellGrid, config: PlanesConfig, sigma: float) -> tuple[Pieces, Agreement]:

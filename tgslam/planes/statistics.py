@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tgslam.plane_fit import CellGrid, Floats, SegmentSums
 from tgslam.planes.estimate import tangent_axes
-from tgslam.planes.moments import information, planes_of, scatter, summed, width_px
+from tgslam.planes.moments import information, scatter, summed, width_px
 from tgslam.planes.segment import PlaneSegment
 
 Indices = NDArray[np.intp]
@@ -17,6 +17,8 @@ Indices = NDArray[np.intp]
 _CLUSTER_CELLS = 4  # side of the squares of cells within which noise may be correlated
 _FITTED = 3  # parameters
 _LEAST_CELLS = 6  # that tell a paraboloid
+_DEGREES = [(degree - k, k) for degree in range(5) for k in range(degree + 1)]  # of x and y: 1, x, y, xx, xy, yy, ...
+_PRODUCTS = np.array([[_DEGREES.index((a + c, b + d)) for c, d in _DEGREES[:6]] for a, b in _DEGREES[:6]])
 _LEAST_WIDTH_PX = 1.0  # of what is not a line
 
 
@@ -35,11 +37,6 @@ class Evidence:
 def totals(sums: SegmentSums, planes: int) -> Floats:
     """[P, 10] moments of each plane's misfits."""
     return summed(sums.moments, sums.plane, planes)
-
-
-def refined(planes: Floats, sums: SegmentSums) -> Floats:
-    """[P, 3] planes moved by the least-squares fit of their misfits."""
-    return planes + planes_of(totals(sums, len(planes)))
 
 
 def evidence(
@@ -198,10 +195,12 @@ def _bends(rows: _Rows) -> tuple[Floats, Floats]:
     size = np.maximum(np.subtract(*ends), 1.0)  # [C, 2] px
     cells = rows.sum(np.ones(len(places)))
     x, y = ((places - (rows.sum(places) / cells[:, None])[rows.number]) / size[rows.number]).T
-    basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-    weighted = basis * rows.weight[:, None]
-    normal = rows.sum((basis[:, :, None] * weighted[:, None]).reshape(-1, 36)).reshape(-1, 6, 6)
-    right = rows.sum(basis * rows.residual[:, None])[:, :, None]
+    powers = [np.ones_like(x), x, y, x * x, x * y, y * y]
+    powers += [power * x for power in powers[3:]] + [powers[5] * y]
+    powers += [power * x for power in powers[6:]] + [powers[9] * y]
+    monomials = np.stack(powers, axis=1)
+    normal = rows.sum(monomials * rows.weight[:, None])[:, _PRODUCTS]
+    right = rows.sum(monomials[:, :6] * rows.residual[:, None])[:, :, None]
     flat = np.linalg.pinv(normal[:, :3, :3], 1e-9, hermitian=True) @ normal[:, :3, 3:]
     curvature = normal[:, 3:, 3:] - normal[:, 3:, :3] @ flat
     slope = right[:, 3:] - np.swapaxes(flat, 1, 2) @ right[:, :3]
