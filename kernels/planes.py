@@ -133,16 +133,26 @@ def label_pixels(
     """Each pixel's plane: that one of the cell's candidates within the tolerance; of several, which its window fits."""
     for c in range(found.shape[0]):
         top, bottom, left, right, _, _ = extent(c, cell, columns, depth.shape[0], depth.shape[1])
+        near = ti.Vector([-1] * CANDIDATES)
+        within = ti.Vector([-1.0] * CANDIDATES)  # nothing is
+        fit = ti.Matrix([[0.0] * 3] * CANDIDATES)
+        for m in ti.static(range(CANDIDATES)):
+            k = found[c, m]
+            if k >= 0:
+                near[m] = k
+                within[m] = tolerance[k]
+                for n in ti.static(range(3)):
+                    fit[m, n] = planes[k, n]
         for v in range(top, bottom):
             for u in range(left, right):
                 label, fitting = -1, 0
                 if depth[v, u] > 0.0:
-                    for m in range(CANDIDATES):
-                        k = found[c, m]
-                        if k >= 0:
-                            if ti.abs(misfit(depth, planes, k, u, v, cx, cy)) <= tolerance[k]:
-                                fitting += 1
-                                label = k
+                    w = 1.0 / depth[v, u]
+                    for m in ti.static(range(CANDIDATES)):
+                        off = w - (fit[m, 0] + fit[m, 1] * (u - cx) + fit[m, 2] * (v - cy))
+                        fits = ti.abs(off) <= within[m]
+                        fitting += ti.select(fits, 1, 0)
+                        label = ti.select(fits, near[m], label)
                 if fitting > 1:
                     least = 1e30
                     for m in range(CANDIDATES):

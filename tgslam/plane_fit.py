@@ -60,10 +60,11 @@ class SegmentSums:
     pixels: Floats  # [R]
     squares: Floats  # [R] 1/m^2, sum of squared misfits, not weighted
 
-    def of(self, plane: int) -> SegmentSums:
-        """The rows of one plane."""
-        at = self.plane == plane
-        return SegmentSums(self.plane[at], self.cell[at], self.moments[at], self.pixels[at], self.squares[at])
+    def rows(self, chosen: NDArray[np.intp]) -> SegmentSums:
+        """Some of them."""
+        return SegmentSums(
+            self.plane[chosen], self.cell[chosen], self.moments[chosen], self.pixels[chosen], self.squares[chosen]
+        )
 
 
 class PixelLabels:
@@ -98,11 +99,12 @@ class PixelLabels:
             self._depth_m, *self._where, self._found, runtime.to_device(planes), self._labels, scale, out
         )
         found, values = runtime.to_host(self._found), runtime.to_host(out)
-        cell, slot = np.nonzero(values[:, :, kernels.RAW_COUNT] > 0)
-        rows = values[cell, slot].astype(np.float64)
+        values = values.reshape(-1, kernels.SEGMENT_SUMS)
+        shared = np.flatnonzero(values[:, kernels.RAW_COUNT] > 0)
+        rows, cell = values[shared].astype(np.float64), shared // kernels.CANDIDATES
         moments = moved(rows[:, : kernels.MOMENTS], grid.centres()[cell], np.zeros(len(cell)))
         return SegmentSums(
-            found[cell, slot].astype(np.intp),
+            found.ravel()[shared].astype(np.intp),
             cell,
             moments,
             rows[:, kernels.RAW_COUNT],

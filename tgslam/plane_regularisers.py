@@ -20,6 +20,7 @@ class PlaneRegularisers:
     def __init__(self, config: StructureConfig) -> None:
         self.config = config
         self._partial = partial_sums(kernels.TOTALS, 1)
+        self._partial.fill(0)
         self._counted = runtime.zeros((kernels.TOTALS,))
         self._totals = runtime.zeros((kernels.TOTALS,))
 
@@ -49,11 +50,11 @@ class PlaneRegularisers:
             config.thinness, config.sigma_distance_m, config.charbonnier_distance_sigmas, self._counted,
             into.mean, into.log_scale, into.quat_wxyz, self._partial,
         )  # fmt: skip
-        add_up(self._partial, self._totals)
 
     @property
     def parts(self) -> dict[str, float]:
         """Means of the last `add` before weighting, and the number of Gaussians; asking for it waits for the device."""
+        add_up(self._partial, self._totals)
         totals = [float(total) for total in runtime.to_host(self._totals)]
         count = totals[kernels.COUNT]
         return {name: totals[column] / max(count, 1.0) for name, column in _PARTS.items()} | {"count": count}

@@ -68,22 +68,25 @@ class Joining:
         origin = np.zeros(3)  # decides on offset ratios only, which are not used here
         forth, back = gate(theirs, ours, origin, config), gate(ours, theirs, origin, config)
         sigmas = np.maximum(forth.deviation_sigmas, back.deviation_sigmas)
+        refused: set[frozenset[PlanarInstance]] = set()  # pairs that come again the other way round
         for i, j in np.argwhere(forth.admitted & back.admitted):
             a, b = touched[i], everything[j]
-            if a is b:
+            pair = frozenset((a, b))
+            if a is b or pair in refused:
                 continue
-            bounding = self._bounds(a, b, everything)
-            if self._coplanar(a, b, float(sigmas[i, j]), bounding) and self._joined(a, b, bounding, samples):
-                return a, b
+            in_views = coplanar_in_views(a, b)
+            if in_views is None or in_views <= config.gate_sigmas:
+                bounding = self._bounds(a, b, everything)
+                coplanar = in_views is not None or self._coplanar(a, b, float(sigmas[i, j]), bounding)
+                if coplanar and self._joined(a, b, bounding, samples):
+                    return a, b
+            refused.add(pair)
         return None
 
     def _coplanar(self, a: PlanarInstance, b: PlanarInstance, sigmas: float, bounding: bool) -> bool:
-        """In the views that show both or, without any, in the world, where they deviate by `sigmas`: by half the gate
-        unless they bound the scene, or the extent of one lies for the most part in that of the other.
+        """Two that no view shows both, and which deviate by `sigmas` in the world: by at most half the gate unless they
+        bound the scene, or the extent of one lies for the most part in that of the other.
         """
-        in_views = coplanar_in_views(a, b)
-        if in_views is not None:
-            return in_views <= self._config.gate_sigmas
         if bounding or sigmas <= WELL * self._config.gate_sigmas:
             return True
         large, cells = _on_larger(a, b)

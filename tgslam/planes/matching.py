@@ -47,6 +47,8 @@ class ViewMatching:
         self.segments = samples.view.segments
         self.local = from_segments(self.segments).with_surface_error(self._areas_m2(), config.model_sigma_m)
         self.local.covariance[[not s.reliable for s in self.segments]] *= _DEFERRED_VARIANCE
+        misfit = deviation_sigmas(self.local[:, None], self.local[None])
+        self._misfit_sigmas = np.maximum(misfit, misfit.T)  # [S, S] of each segment and each other one
         self.owner: list[PlanarInstance | None] = [None] * len(self.segments)
         self.sights = self._sights()
         self._known = len(self.instances)  # those after are new in this view
@@ -199,9 +201,7 @@ class ViewMatching:
         return (segment, other) in steps or (other, segment) in steps
 
     def _coplanar(self, segment: int, pieces: list[int]) -> bool:
-        own, others = self.local[segment : segment + 1], self.local[pieces]
-        sigmas = np.maximum(deviation_sigmas(own, others), deviation_sigmas(others, own))
-        return bool(np.all(sigmas <= self.config.gate_sigmas))
+        return bool(np.all(self._misfit_sigmas[segment, pieces] <= self.config.gate_sigmas))
 
     def is_parted(self, segment: int, instance: PlanarInstance) -> bool:
         """Whether gaps part a segment from all others that show the instance, and its extent does not connect them:
