@@ -229,6 +229,7 @@ class StructureConfig:
     edge_boost: float = setting(2.0, 0.0, 100.0)  # pixels at a boundary weigh 1 + this
     weight_none: float = setting(0.5, 0.0, 1.0)  # weight of measured pixels that are on no plane
     relaxation: float = setting(1.0, 0.0, 1.9)  # of embeddings; 1 = the full step
+    fringe_share: float = setting(2.0, 0.0, 100.0)  # of its best view: one that shows less of a Gaussian moves it less
     read_margin: float = setting(0.05, 0.0, 1.0)  # ids are read where no other code is less than this farther
     read_opacity: float = setting(0.5, 0.01, 1.0)  # and rendered opacity is at least this
     read_distance_m: float = setting(0.05, 0.0, 10.0)  # and the rendered surface is at most this far from the plane

@@ -12,6 +12,7 @@ from tgslam.config.schema import StructureConfig
 from tgslam.gaussian_map import GaussianMap, MapGradient
 from tgslam.instance_field import InstanceGradient, InstanceTarget
 from tgslam.mapping.keyframe import Keyframe
+from tgslam.mapping.sightings import Sightings
 from tgslam.plane_regularisers import PlaneRegularisers
 from tgslam.planes.codes import code_table
 from tgslam.planes.table import PlaneTable
@@ -57,12 +58,18 @@ class StructureTerms:
             self._regularisers.add(gaussians, visible, self._planes, gradient)
 
     def move_embeddings(
-        self, gaussians: GaussianMap, visible: np.ndarray, gradient: MapGradient, target: InstanceTarget
+        self,
+        gaussians: GaussianMap,
+        visible: np.ndarray,
+        gradient: MapGradient,
+        sightings: Sightings,
+        target: InstanceTarget,
     ) -> None:
         """Relax the embeddings; the curvature's second column must hold the weights of E_pgi."""
         instance_field.relax(
-            gaussians.count, visible, gradient.embedding, gradient.curvature, target, self.config, gaussians.embedding
-        )
+            gaussians.count, visible, gradient.embedding, gradient.curvature, sightings.most_px, target, self.config,
+            gaussians.embedding,
+        )  # fmt: skip
 
     @property
     def parts(self) -> dict[str, float]:
