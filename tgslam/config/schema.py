@@ -166,7 +166,7 @@ class PlanesConfig:
 
     enabled: bool = setting(False)  # False: the map knows nothing of planes
     # Segments of single views (section 3.2); sigmas are of the sensor's inverse depth at a pixel
-    max_segments: int = setting(16, 1, 1000)  # K: the largest ones are kept
+    max_segments: int = setting(32, 1, 1000)  # K: the largest ones are kept
     cells_across: int = setting(80, 8, 1000)  # the image: segmentation starts from squares of at least 4 px
     cell_share: float = setting(0.5, 0.1, 1.0)  # of a cell's pixels that must be measured
     cell_sigmas: float = setting(1.4, 0.1, 100.0)  # a cell whose residual is more is not plane
