@@ -10,7 +10,7 @@ from tests.plane_views import DEPTH_SIGMA_PER_M2, Rectangle, Stage, cast, lookin
 from tgslam.config.schema import PlanesConfig
 from tgslam.errors import EvaluationError
 from tgslam.evaluation.trajectory import align_poses
-from tgslam.geometry import se3_exp
+from tgslam.geometry import inverse, se3_exp, transform_points
 from tgslam.mapping.extents import KnownExtents
 from tgslam.types import Trajectory
 
@@ -58,3 +58,13 @@ def test_worlds_are_aligned_by_where_cameras_look() -> None:
     assert_allclose(T, world, atol=0.004)
     with pytest.raises(EvaluationError, match="none of 20 poses"):
         align_poses(estimate, Trajectory(times + 100.0, truth), 0.02)
+
+
+def test_points_in_a_cameras_frame_lie_over_the_extent_that_they_lie_over_in_the_world() -> None:
+    stage = Stage([WALL])
+    _, ids = stage.show(HERE)
+    support = stage.registry.instances[ids[0][0]].support
+    points_w = np.random.default_rng(0).uniform((-2.0, 2.9, 0.0), (2.0, 3.1, 2.5), (2000, 3))
+    found = support.shows_extent(transform_points(HERE, points_w).T, inverse(HERE))
+    assert 0.05 < np.mean(found) < 0.95
+    np.testing.assert_array_equal(found, support.holds(support.cells_of(points_w)))

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from tests.reference import planes as reference
 from tgslam import plane_fit, runtime
-from tgslam.planes.moments import joining_cost, planes_of, squared_residuals
+from tgslam.planes.moments import Joints, planes_of, squared_residuals
 from tgslam.types import Camera
 
 SIGMA = 0.0015
@@ -98,7 +98,7 @@ def test_a_plane_without_noise_is_fitted_exactly(g0, gx, gy, seed):
     moments, _ = plane_fit.cell_moments(runtime.to_device(depth_m), plane_fit.CellGrid(camera, 8))
     np.testing.assert_allclose(planes_of(moments), np.tile([g0, gx, gy], (4, 1)), atol=1e-6)
     first, second = np.array([0, 0, 1]), np.array([1, 2, 3])
-    assert (joining_cost(moments, squared_residuals(moments), first, second) < 1e-3 * SIGMA**2).all()
+    assert (Joints.of(moments, first, second).cost < 1e-3 * SIGMA**2).all()
 
 
 def test_moments_move_like_their_points():
@@ -123,7 +123,7 @@ def test_fits_and_joining_costs_are_least_squares():
     for plane, residual, p in zip(planes_of(moments), squared_residuals(moments), points, strict=True):
         np.testing.assert_allclose(plane, solved(p)[0], rtol=1e-9)
         np.testing.assert_allclose(residual, solved(p)[1], rtol=1e-9)
-    cost = joining_cost(moments, squared_residuals(moments), np.array([0]), np.array([1]))
+    cost = Joints.of(moments, np.array([0]), np.array([1])).cost
     expected = solved(np.concatenate(points))[1] - solved(points[0])[1] - solved(points[1])[1]
     np.testing.assert_allclose(cost, expected, rtol=1e-9)
 

@@ -60,10 +60,11 @@ class SegmentSums:
     pixels: Floats  # [R]
     squares: Floats  # [R] 1/m^2, sum of squared misfits, not weighted
 
-    def of(self, plane: int) -> SegmentSums:
-        """The rows of one plane."""
-        at = self.plane == plane
-        return SegmentSums(self.plane[at], self.cell[at], self.moments[at], self.pixels[at], self.squares[at])
+    def rows(self, chosen: NDArray[np.intp]) -> SegmentSums:
+        """Some of them."""
+        return SegmentSums(
+            self.plane[chosen], self.cell[chosen], self.moments[chosen], self.pixels[chosen], self.squares[chosen]
+        )
 
 
 class PixelLabels:

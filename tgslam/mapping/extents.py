@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.config.schema import PlanesConfig
-from tgslam.geometry import inverse, transform_points
+from tgslam.geometry import inverse
 from tgslam.planes.instance import NO_ID, PlanarInstance
 
 Points = NDArray[np.float64]
@@ -28,24 +28,23 @@ class KnownExtents:
     ) -> None:
         """instances: the PGIs by id. depth_m: [H, W] m. rays: [H, W, 3] camera frame, z = 1."""
         self._instances, self._config, self._sigma_per_m2 = instances, config, sigma_per_m2
-        self._depth_m, self._rays, self._T_cw = depth_m, rays, T_cw
+        self._depth_m, self._rays, self._T_cw, self._T_wc = depth_m, rays, T_cw, inverse(T_cw)
 
     def completed(self, ids: NDArray[np.int32]) -> NDArray[np.int32]:
         """ids [H, W] where pixels of no PGI have that one on whose extent they lie, to the sensor's accuracy.
 
         A view leaves out what is small, far or at a bad angle; other views know it, and it still is no empty space.
         """
-        rows, columns = np.nonzero((ids == NO_ID) & (self._depth_m > 0))
-        points = self._points_w(rows, columns)
-        least = np.full(len(rows), np.inf)
-        found = np.full(len(rows), NO_ID, np.int32)
+        pixels, points = self._measured(ids == NO_ID)
+        least = np.full(len(pixels), self._config.gate_sigmas**2)
+        found = np.full(len(pixels), NO_ID, np.int32)
         for instance in self._in_view():
-            sigmas = np.abs(instance.plane.heights_m(points)) / self._height_sigma_m(instance, rows, columns)
-            near = np.flatnonzero((sigmas <= self._config.gate_sigmas) & (sigmas < least))
-            near = near[instance.support.holds(instance.support.cells_of(points[near]))]
-            least[near], found[near] = sigmas[near], instance.id
+            squares = self._squared_sigmas(instance, points)
+            near = np.flatnonzero(squares < least)
+            near = near[instance.support.shows_extent(points[:, near], self._T_wc)]
+            least[near], found[near] = squares[near], instance.id
         result = ids.copy()
-        result[rows, columns] = found
+        result.ravel()[pixels] = found
         return result
 
     def divided(self, ids: NDArray[np.int32], plane_id: int, others: Sequence[PlanarInstance]) -> NDArray[np.int32]:
@@ -53,14 +52,12 @@ class KnownExtents:
 
         From afar a view takes for one surface what nearer views have parted.
         """
-        own = self._instances[plane_id].support
-        rows, columns = np.nonzero((ids == plane_id) & (self._depth_m > 0))
-        points = self._points_w(rows, columns)
-        beyond = ~own.holds(own.cells_of(points))
+        pixels, points = self._measured(ids == plane_id)
+        beyond = ~self._instances[plane_id].support.shows_extent(points, self._T_wc)
+        pixels, points = pixels[beyond], points[:, beyond]
         result = ids.copy()
         for other in others:
-            theirs = beyond & other.support.holds(other.support.cells_of(points))
-            result[rows[theirs], columns[theirs]] = other.id
+            result.ravel()[pixels[other.support.shows_extent(points, self._T_wc)]] = other.id
         return result
 
     def _in_view(self) -> list[PlanarInstance]:
@@ -69,19 +66,20 @@ class KnownExtents:
             return []
         normals = np.stack([instance.normal_w for instance in instances])
         offsets = np.array([instance.offset_m for instance in instances])
-        front = normals @ inverse(self._T_cw)[:3, 3] + offsets > 0
+        front = normals @ self._T_wc[:3, 3] + offsets > 0
         return [instance for instance, seen in zip(instances, front, strict=True) if seen]
 
-    def _points_w(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Points:
-        return transform_points(
-            inverse(self._T_cw), self._rays[rows, columns] * self._depth_m[rows, columns, None].astype(np.float64)
-        )
+    def _measured(self, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Points]:
+        """The pixels [N] with depth out of those chosen [H, W], counted row by row; their points [3, N] m, camera."""
+        pixels = np.flatnonzero(chosen & (self._depth_m > 0))
+        z = self._depth_m.ravel()[pixels]
+        return pixels, np.ascontiguousarray((self._rays.reshape(-1, 3)[pixels] * z[:, None]).T)
 
-    def _height_sigma_m(
-        self, instance: PlanarInstance, rows: NDArray[np.intp], columns: NDArray[np.intp]
-    ) -> NDArray[np.float64]:
-        """[N] of what the sensor measures at pixels, over a plane."""
-        facing = self._rays[rows, columns] @ (self._T_cw[:3, :3] @ instance.normal_w)
-        sigma_m = self._sigma_per_m2 * self._depth_m[rows, columns].astype(np.float64) ** 2 * facing
-        result: NDArray[np.float64] = np.hypot(sigma_m, self._config.model_sigma_m)
+    def _squared_sigmas(self, instance: PlanarInstance, points: Points) -> Points:
+        """[N] by how many standard deviations of what the sensor measures points [3, N] m lie off a plane, squared."""
+        normal = self._T_cw[:3, :3] @ instance.normal_w
+        offset_m = instance.offset_m + float(instance.normal_w @ self._T_wc[:3, 3])
+        along = normal[0] * points[0] + normal[1] * points[1] + normal[2] * points[2]
+        sigma_m = self._sigma_per_m2 * points[2] * along
+        result: Points = (along + offset_m) ** 2 / (sigma_m**2 + self._config.model_sigma_m**2)
         return result

@@ -134,7 +134,7 @@ class PlanarMapping:
     ) -> NDArray[np.int32]:
         """What the view's segments say, corrected by what is known of the PGIs from other views."""
         extents = self._extents(depth_m, T_cw)
-        return extents.completed(self._divided(ids, np.unique(ids[ids != NO_ID]).tolist(), extents))
+        return extents.completed(self._divided(ids, _named(ids).tolist(), extents))
 
     def _divided(self, ids: NDArray[np.int32], plane_ids: Sequence[int], extents: KnownExtents) -> NDArray[np.int32]:
         for plane_id in plane_ids:
@@ -152,27 +152,39 @@ class PlanarMapping:
         depth_m = np.zeros(ids.shape, np.float32)
         normals_c = np.zeros((*ids.shape, 3), np.float32)
         kept = np.full(ids.shape, NO_ID, np.int32)
-        for plane_id, instance in self.instances.items():
-            at = np.nonzero(ids == plane_id)
-            if not len(at[0]):
+        instances = self.instances
+        for plane_id in _named(ids).tolist():
+            if plane_id not in instances:
                 continue
+            at = np.flatnonzero(ids == plane_id)
+            instance, measured = instances[plane_id], measured_m.ravel()[at]
             normal = T_cw[:3, :3] @ instance.normal_w
             offset_m = instance.offset_m - normal @ T_cw[:3, 3]
-            z = -offset_m / np.minimum(self._rays[at] @ normal, -1e-6)
+            z = -offset_m / np.minimum(self._rays.reshape(-1, 3)[at] @ normal, -1e-6)
             sigma_m = self.sigma_per_m2 * z**2
-            agrees = np.abs(z - measured_m[at]) < _AGREEMENT * (sigma_m + self.config.model_sigma_m)
-            agrees |= measured_m[at] <= 0
-            on = at[0][agrees], at[1][agrees]
-            depth_m[on], normals_c[on], kept[on] = z[agrees], normal, plane_id
+            agrees = np.abs(z - measured) < _AGREEMENT * (sigma_m + self.config.model_sigma_m)
+            agrees |= measured <= 0
+            on = at[agrees]
+            depth_m.ravel()[on], kept.ravel()[on] = z[agrees], plane_id
+            normals_c.reshape(-1, 3)[on] = normal
         return PlanarPixels(kept, depth_m, normals_c)
 
     def _closed(self, ids: NDArray[np.int32]) -> NDArray[np.int32]:
         """Pixels that one PGI surrounds belong to it: holes and outliers of the sensor."""
-        known = np.unique(ids[ids >= 0])
-        index = (np.searchsorted(known, ids) + 1).astype(np.uint8) * (ids >= 0).astype(np.uint8)
+        known = _named(ids)
+        number = np.zeros(int(known.max(initial=NO_ID)) + 2, np.uint8)
+        number[known + 1] = np.arange(1, len(known) + 1)
+        index = number[ids + 1]
         square = np.ones((_CLOSING_PX, _CLOSING_PX), np.uint8)
         highest = cv2.dilate(index, square)
         lowest = cv2.erode(np.where(index > 0, index, np.uint8(255)), square, borderValue=255)
         share = cv2.blur((index > 0).astype(np.float32), square.shape)
         fill = (index == 0) & (highest == lowest) & (share > _CLOSING_SHARE)
-        return np.where(fill, np.append(NO_ID, known)[highest], ids).astype(np.int32)
+        filled: NDArray[np.int32] = ids.copy()
+        filled[fill] = known[highest[fill] - 1]
+        return filled
+
+
+def _named(ids: NDArray[np.int32]) -> NDArray[np.intp]:
+    """The PGIs, ascending, that an image of ids [H, W] names."""
+    return np.flatnonzero(np.bincount(ids.ravel() + 1)[1:])

@@ -10,10 +10,9 @@ from scipy.spatial import cKDTree
 
 from tgslam.plane_fit import CellGrid, Floats, Labels
 from tgslam.planes.merging import Agreement, Indices
-from tgslam.planes.moments import joining_cost, planes_of, squared_residuals
+from tgslam.planes.moments import Joints, planes_of
 
 _SIGMAS = 3.0  # beyond which a measurement lies before or behind a plane
-_RUN = 2  # samples one after the other off the plane: one alone is a border's ragged pixel
 _OPEN_SHARE = 0.2  # of the ways between two pieces, that may be open: their borders need not be parallel
 _CLOSED_SHARE = 0.5  # of the ways that have to be known to be closed; without measurements nothing is known
 _SEEN_SHARE = 0.5  # of a way that is measured when it is known
@@ -41,36 +40,34 @@ def bridge(
     depth_m: host [H, W] m, 0 = none. across_area_m2: of two pieces with something else before the gap the larger one
     has to be as large; small things that happen to be level are as likely. The joined pieces are renumbered.
     """
-    labels, moments = pieces.labels.copy(), pieces.moments.copy()
-    size = len(moments)
+    moments, size = pieces.moments.copy(), len(pieces.moments)
+    outlines = _Outlines(pieces.labels)
     cost = np.full((size, size), np.inf)
-    for a in range(size - 1):
-        _compare(cost, moments, a, np.arange(a + 1, size), agreement)
+    _compare(cost, moments, *np.triu_indices(size, 1), agreement)
     while np.isfinite(cost).any():
         a, b = (int(i) for i in np.unravel_index(np.argmin(cost), cost.shape))
         plane = planes_of(moments[None, a] + moments[None, b])[0]
-        gap = _gap(labels == a, labels == b, plane, depth_m, grid, agreement.sigma)
-        large = _area_m2(moments[[a, b]], plane, grid).max() >= across_area_m2
+        gap = _gap(outlines, a, b, plane, depth_m, grid, agreement.sigma)
+        large = gap.closed and _area_m2(moments[[a, b]], plane, grid).max() >= across_area_m2
         if not (gap.closed and (large or gap.free)):
             cost[a, b] = np.inf
             continue
-        labels[labels == b] = a
+        outlines.join(a, b)
         moments[a] += moments[b]
         moments[b] = 0.0
         cost[b] = cost[:, b] = np.inf
         others = np.flatnonzero((moments[:, 0] > 0) & (np.arange(size) != a))
-        _compare(cost, moments, a, others, agreement)
+        _compare(cost, moments, np.minimum(a, others), np.maximum(a, others), agreement)
     alive = np.flatnonzero(moments[:, 0] > 0)
     number = np.full(size + 1, -1, np.int32)
     number[alive] = np.arange(len(alive))
-    return Pieces(number[labels], moments[alive])
+    return Pieces(number[outlines.labels], moments[alive])
 
 
-def _compare(cost: Floats, moments: Floats, piece: int, others: Indices, agreement: Agreement) -> None:
-    """Write what joining a piece to others costs, above the diagonal of `cost` [G, G]; infinite where they disagree."""
-    pairs = np.stack([np.minimum(piece, others), np.maximum(piece, others)])
-    found = joining_cost(moments, squared_residuals(moments), *pairs)
-    cost[tuple(pairs)] = np.where(agreement.admits(found, moments[pairs[0]], moments[pairs[1]]), found, np.inf)
+def _compare(cost: Floats, moments: Floats, first: Indices, second: Indices, agreement: Agreement) -> None:
+    """Write what joining pairs of pieces costs, first < second, to `cost` [G, G]; infinite where they disagree."""
+    joints = Joints.of(moments, first, second)
+    cost[first, second] = np.where(agreement.admits(joints), joints.cost, np.inf)
 
 
 def _area_m2(moments: Floats, plane: Floats, grid: CellGrid) -> Floats:
@@ -85,6 +82,47 @@ def _offset_m(plane: Floats, grid: CellGrid) -> float:
     return 1.0 / float(np.linalg.norm(plane[[1, 2, 0]] * np.array([grid.camera.fx, grid.camera.fy, 1.0])))
 
 
+class _Outlines:
+    """Where pieces are, and the shortest ways from rim to rim."""
+
+    def __init__(self, labels: Labels) -> None:
+        """labels: [rows, columns] pieces of the cells, -1 = none."""
+        self._padded = np.pad(labels, 1, constant_values=-1)
+        self.labels = self._padded[1:-1, 1:-1]
+        self._cells = np.bincount(labels.ravel() + 1)[1:]
+        self._rims: dict[int, tuple[Indices, cKDTree]] = {}  # those that have been asked for
+
+    def join(self, kept: int, gone: int) -> None:
+        """The cells of one piece are another one's."""
+        self.labels[self.labels == gone] = kept
+        self._cells[kept] += self._cells[gone]
+        self._rims.pop(kept, None)
+
+    def links(self, first: int, second: int) -> Floats:
+        """[L, 2, 2] the shortest ways from the smaller piece's rim to the larger one's: row and column of both cells.
+
+        None where the gap is too wide for the pieces.
+        """
+        small, large = (first, second) if self._cells[first] <= self._cells[second] else (second, first)
+        (start, _), (target, tree) = self._rim(small), self._rim(large)
+        distance, nearest = tree.query(start)
+        least = distance.min()
+        if least > _REACH * np.sqrt(self._cells[large]):
+            return np.empty((0, 2, 2))
+        near = np.flatnonzero(distance <= 1.5 * least + 2.0)
+        near = near[:: -(-len(near) // _LINKS)]
+        return np.stack([start[near], target[nearest[near]]], axis=1)
+
+    def _rim(self, piece: int) -> tuple[Indices, cKDTree]:
+        """[R, 2] row and column of the cells of a piece that have a side on no cell of it; also as a tree."""
+        if piece not in self._rims:
+            own = self._padded == piece
+            inner = own[:-2, 1:-1] & own[2:, 1:-1] & own[1:-1, :-2] & own[1:-1, 2:]
+            cells = np.argwhere(own[1:-1, 1:-1] & ~inner)
+            self._rims[piece] = cells, cKDTree(cells)
+        return self._rims[piece]
+
+
 @dataclass(frozen=True)
 class _Gap:
     """What is seen between two pieces of one plane."""
@@ -94,15 +132,16 @@ class _Gap:
 
 
 def _gap(
-    first: NDArray[np.bool_],
-    second: NDArray[np.bool_],
+    outlines: _Outlines,
+    first: int,
+    second: int,
     plane: Floats,
     depth_m: NDArray[np.float32],
     grid: CellGrid,
     sigma: float,
 ) -> _Gap:
-    """Look along the shortest ways between two pieces (masks of cells)."""
-    ends = _links(first, second)
+    """Look along the shortest ways between two pieces."""
+    ends = outlines.links(first, second)
     if not len(ends):
         return _Gap(False, False)
     longest_px = float(np.abs(ends[:, 1] - ends[:, 0]).max()) * grid.cell_px
@@ -111,40 +150,22 @@ def _gap(
     inside = np.rint(cells * grid.cell_px + (grid.cell_px - 1) / 2).astype(int)
     v = np.minimum(inside[..., 0], depth_m.shape[0] - 1)
     u = np.minimum(inside[..., 1], depth_m.shape[1] - 1)
-    between = ~(first | second)[v // grid.cell_px, u // grid.cell_px]
+    piece = outlines.labels[v // grid.cell_px, u // grid.cell_px]
+    between = (piece != first) & (piece != second)
     z = depth_m[v, u].astype(np.float64)
     seen = between & (z > 0)
     measured = 1.0 / np.where(seen, z, 1.0)
     expected = plane[0] + plane[1] * (u - grid.camera.cx) + plane[2] * (v - grid.camera.cy)
     behind = seen & (measured - expected < -_SIGMAS * sigma)
+    opened = _run(behind)
+    known = ~opened & (seen.sum(axis=0) >= _SEEN_SHARE * between.sum(axis=0))
+    if opened.mean() > _OPEN_SHARE or known.mean() < _CLOSED_SHARE:
+        return _Gap(False, False)
     before_m = _offset_m(plane, grid) * (1.0 - expected / measured)
     close = seen & (measured - expected > _SIGMAS * sigma) & (before_m < _CLOSE_M)
-    opened, parted = _run(behind), _run(behind | close)
-    known = ~opened & (seen.sum(axis=0) >= _SEEN_SHARE * between.sum(axis=0))
-    closed = opened.mean() <= _OPEN_SHARE and known.mean() >= _CLOSED_SHARE
-    return _Gap(bool(closed), bool(parted.mean() <= _PARTED_SHARE))
+    return _Gap(True, bool(_run(behind | close).mean() <= _PARTED_SHARE))
 
 
 def _run(samples: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """[L] ways with several of the samples [S, L] one after the other."""
-    windows = np.lib.stride_tricks.sliding_window_view(samples, _RUN, axis=0)
-    return np.asarray(windows.all(axis=-1).any(axis=0))
-
-
-def _links(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> Floats:
-    """[L, 2, 2] the shortest ways from the smaller piece's rim to the larger one's: row and column of both cells."""
-    small, large = (first, second) if first.sum() <= second.sum() else (second, first)
-    start, target = _rim(small), _rim(large)
-    distance, nearest = cKDTree(target).query(start)
-    if distance.min() > _REACH * np.sqrt(large.sum()):
-        return np.empty((0, 2, 2))
-    near = np.flatnonzero(distance <= 1.5 * distance.min() + 2.0)
-    near = near[:: -(-len(near) // _LINKS)]
-    return np.stack([start[near], target[nearest[near]]], axis=1)
-
-
-def _rim(mask: NDArray[np.bool_]) -> Indices:
-    """[R, 2] row and column of the cells that have a neighbour outside."""
-    around = np.pad(mask, 1)
-    inner = around[:-2, 1:-1] & around[2:, 1:-1] & around[1:-1, :-2] & around[1:-1, 2:]
-    return np.argwhere(mask & ~inner)
+    """[L] ways with two of the samples [S, L] one after the other: one alone is a border's ragged pixel."""
+    return np.asarray((samples[1:] & samples[:-1]).any(axis=0))

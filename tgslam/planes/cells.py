@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from scipy.ndimage import median_filter
 
 from tgslam import plane_fit
 from tgslam.plane_fit import CellGrid, Floats
-from tgslam.planes.moments import NOISE, squared_residuals
+from tgslam.planes.moments import NOISE, Joints, squared_residuals, summed
 
 Indices = NDArray[np.intp]
 
@@ -26,6 +27,11 @@ class CellGraph:
     moments: Floats  # [N, 11] with the noise's variance
     edges: Indices  # [E, 2] nodes, the smaller first
 
+    @cached_property
+    def joints(self) -> Joints:
+        """The sets of points at both ends of each edge [E], as one."""
+        return Joints.of(self.moments, *self.edges.T)
+
     def squares(self, shape: tuple[int, int], side: int, sigmas: float) -> CellGraph:
         """The same of squares of `side` x `side` cells, all of them planar and on one plane as cells have to be.
 
@@ -35,8 +41,7 @@ class CellGraph:
         rows, columns = shape[0] // side, shape[1] // side
         inside = (row < rows * side) & (column < columns * side)
         square = (row // side * columns + column // side)[inside]
-        moments = np.zeros((rows * columns, self.moments.shape[1]))
-        np.add.at(moments, square, self.moments[inside])
+        moments = summed(self.moments[inside], square, rows * columns)
         whole = np.bincount(square, minlength=len(moments)) == side**2
         flat = whole & _fits(moments, moments[:, NOISE] / np.maximum(moments[:, 0], 1.0), sigmas)
         return CellGraph(np.flatnonzero(flat), moments[flat], _neighbours(flat.reshape(rows, columns)))

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 import numpy as np
 
 from tgslam import runtime
 from tgslam.config.schema import PlanesConfig
-from tgslam.plane_fit import CellGrid, Floats, PixelLabels, SegmentSums
+from tgslam.plane_fit import CellGrid, Floats, PixelLabels
 from tgslam.planes.bridging import Pieces, bridge
 from tgslam.planes.cells import CellGraph, planar_cells
 from tgslam.planes.layers import bordering, group_moments, parallel, part_layers, settle
 from tgslam.planes.merging import Agreement, Indices, agglomerate
-from tgslam.planes.moments import NOISE, joining_cost, noise_of, planes_of, squared_residuals, width_px
+from tgslam.planes.moments import NOISE, noise_of, planes_of, squared_residuals
 from tgslam.planes.segment import PlaneSegment, PlaneView
 from tgslam.planes.statistics import Evidence, evidence, refined, totals
 from tgslam.types import Camera
@@ -53,7 +53,7 @@ def extract_planes(depth_m: np.ndarray, camera: Camera, config: PlanesConfig, si
         moments[:, NOISE] *= moments[:, 0]
         planes, aligned, stepped = parallel(refined(before, sums), moments, pairs, agreement, grid.cell_px)
     fewest_px = max(config.min_area_share * camera.width * camera.height, _FEWEST_PX)
-    seen = _evidence(planes, planes - before, sums, grid, sigma_per_m2, fewest_px)
+    seen = evidence(planes, planes - before, sums, grid, sigma_per_m2, fewest_px)
     found = _with_alignment(_judged(seen, noise / sigma_per_m2, grid, config), aligned)
     number = np.full(len(planes) + 1, -1, np.int32)
     number[[index for index, _ in found]] = np.arange(len(found))
@@ -92,19 +92,7 @@ def _numbered(graph: CellGraph, group: Indices, grid: CellGrid, least_px: float)
 
 def _continuous(graph: CellGraph, agreement: Agreement) -> Indices:
     """[E, 2] those edges of the graph across which the surface has no step."""
-    first, second = graph.edges.T
-    cost = joining_cost(graph.moments, squared_residuals(graph.moments), first, second)
-    return graph.edges[agreement.admits(cost, graph.moments[first], graph.moments[second])]
-
-
-def _evidence(
-    planes: Floats, change: Floats, sums: SegmentSums, grid: CellGrid, sigma: float, fewest_px: float
-) -> Iterator[tuple[int, Evidence]]:
-    """Index and evidence of the planes with enough pixels, in more than a line; change: [P, 3] since the sums."""
-    for index in range(len(planes)):
-        rows = sums.of(index)
-        if rows.pixels.sum() >= fewest_px and width_px(rows.moments.sum(axis=0)) >= 1.0:
-            yield index, evidence(planes[index], change[index], rows, grid, sigma)
+    return graph.edges[agreement.admits(graph.joints)]
 
 
 def _judged(

@@ -9,14 +9,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from tgslam.plane_fit import Floats, Labels
 from tgslam.planes.cells import CellGraph
 from tgslam.planes.merging import Agreement, Indices
-from tgslam.planes.moments import NOISE, information, joining_cost, planes_of, squared_residuals, width_px
+from tgslam.planes.moments import NOISE, Joints, information, planes_of, summed, width_px
 
 _WINDOW_CELLS = 3  # over which misfits are averaged
 _OFF_SIGMAS = 2.5  # of such means: beyond it a cell stands off
@@ -31,8 +30,6 @@ _NARROW_CELLS = 5  # wide is a strip that may seem turned by as much as surfaces
 _FEWEST_PX = 6.0  # of what is compared
 _STEP_M = 0.1  # along the line of sight at most from one to the other
 
-_SIDES = ((0, 1), (0, -1), (1, 0), (-1, 0))
-
 
 def part_layers(
     graph: CellGraph, shape: tuple[int, int], group: Indices, agreement: Agreement, least_px: float
@@ -46,8 +43,7 @@ def part_layers(
     misfit = _misfits(graph, planes_of(moments)[group])
     for index in np.flatnonzero(moments[:, 0] > 2 * least_px):
         nodes = np.flatnonzero(group == index)
-        off = _standing_off(misfit[nodes], graph.cell[nodes], shape)
-        for part in off:
+        for part in _standing_off(misfit[nodes], graph.cell[nodes], shape, graph.moments[nodes, 0], least_px):
             chosen = graph.moments[nodes[part]].sum(axis=0)
             pair = np.stack([chosen, moments[index] - chosen])
             if chosen[0] >= least_px and not _agree(pair, agreement):
@@ -64,13 +60,13 @@ def settle(graph: CellGraph, shape: tuple[int, int], group: Indices, large_px: f
     grid = np.full(shape, -1, np.intp)
     for _ in range(_ROUNDS):
         moments = group_moments(graph, group)
-        planes, large = planes_of(moments), np.flatnonzero(moments[:, 0] > large_px)
+        is_large = moments[:, 0] > large_px
         grid.ravel()[graph.cell] = group
-        around = np.stack([_shifted(grid, side).ravel()[graph.cell] for side in _SIDES])
-        others = ((around != group) & (around >= 0)).any(axis=0) | ~np.isin(group, large)
+        around = _around(grid)[:, graph.cell]
+        others = ((around != group) & (around >= 0)).any(axis=0) | ~is_large[group]
         open_ = np.flatnonzero((group >= 0) & others)
         settled = group.copy()
-        settled[open_] = _choice(graph.moments[open_], group[open_], around[:, open_], large, planes)
+        settled[open_] = _choice(graph.moments[open_], group[open_], around[:, open_], is_large, planes_of(moments))
         if (settled == group).all():
             break
         group = settled
@@ -88,26 +84,27 @@ def parallel(
     one that is parallel to it, and the pairs (smaller, larger) that a step parts: more of it than the sensor may feign
     or a surface may have.
     """
-    aligned: dict[int, int] = {}
-    result, stepped = planes.copy(), []
     size_px = moments[:, 0]
     beside = (size_px[pairs[:, 1]] >= _LARGER * size_px[pairs[:, 0]]) & (size_px[pairs[:, 0]] >= _FEWEST_PX)
-    for small, large in pairs[beside]:
-        weight, reference = information(moments[small]), planes[large]
-        size = float(reference @ weight @ reference)
-        scale = float(reference @ weight @ planes[small]) / size
-        depth_m = moments[small, 0] / max(float(weight[0] @ planes[small]), 1e-9)
-        rest = planes[small] - scale * reference
-        noise = agreement.sigmas**2 * moments[small, NOISE] / moments[small, 0] + agreement.common
-        shift = (agreement.shift_m / depth_m**2) ** 2 * moments[small, 0]
-        allowed = noise + shift if width_px(moments[small]) <= _NARROW_CELLS * cell_px else noise
-        if abs(scale - 1.0) * depth_m <= _STEP_M and float(rest @ weight @ rest) <= allowed:
-            result[small] = scale * reference
-            aligned[int(small)] = int(large)
-            bent = (agreement.shift_sigmas * agreement.sigma) ** 2 * moments[small, 0]
-            if (scale - 1.0) ** 2 * size > noise + shift + bent:
-                stepped.append((int(small), int(large)))
-    return result, aligned, stepped
+    small, large = pairs[beside].T
+    count, own, reference = size_px[small], planes[small], planes[large]
+    weight = information(moments[small])
+    weighted = np.einsum("kij,kj->ki", weight, reference)
+    size = np.sum(reference * weighted, axis=1)
+    scale = np.sum(own * weighted, axis=1) / size
+    depth_m = count / np.maximum(np.sum(weight[:, 0] * own, axis=1), 1e-9)
+    rest = own - scale[:, None] * reference
+    noise = agreement.sigmas**2 * moments[small, NOISE] / count + agreement.common
+    shift = (agreement.shift_m / depth_m**2) ** 2 * count
+    allowed = noise + np.where(width_px(moments[small]) <= _NARROW_CELLS * cell_px, shift, 0.0)
+    level = np.einsum("ki,kij,kj->k", rest, weight, rest) <= allowed
+    level &= np.abs(scale - 1.0) * depth_m <= _STEP_M
+    bent = (agreement.shift_sigmas * agreement.sigma) ** 2 * count
+    step = level & ((scale - 1.0) ** 2 * size > noise + shift + bent)
+    result = planes.copy()
+    result[small[level]] = scale[level, None] * reference[level]
+    aligned = dict(zip(small[level].tolist(), large[level].tolist(), strict=True))
+    return result, aligned, list(zip(small[step].tolist(), large[step].tolist(), strict=True))
 
 
 def bordering(labels: Labels) -> Indices:
@@ -121,11 +118,15 @@ def bordering(labels: Labels) -> Indices:
     return np.stack(np.divmod(keys, base), axis=1).astype(np.intp)
 
 
-def _choice(moments: Floats, group: Indices, around: Indices, large: Indices, planes: Floats) -> Indices:
-    """The best group [K] of nodes with moments [K, 11], out of their own [K], those around [4, K] and large ones."""
-    choices = np.concatenate([group[None], around, np.broadcast_to(large[:, None], (len(large), len(group)))])
-    cost = np.stack([_squares(moments, planes[choice]) for choice in choices])
-    cost -= _NEIGHBOUR * (choices[:, None] == around[None]).sum(axis=1) + _LARGE * np.isin(choices, large)
+def _choice(moments: Floats, group: Indices, around: Indices, is_large: NDArray[np.bool_], planes: Floats) -> Indices:
+    """The best group [K] of nodes with moments [K, 11], out of their own [K], those around [4, K] and large ones.
+
+    is_large, planes: [G + 1] of each group, the last one standing for -1.
+    """
+    large = np.flatnonzero(is_large)[:, None]
+    choices = np.concatenate([group[None], around, np.broadcast_to(large, (len(large), len(group)))])
+    cost = _squares(moments, planes[choices])
+    cost -= _NEIGHBOUR * (choices[:, None] == around[None]).sum(axis=1) + _LARGE * is_large[choices]
     cost[choices < 0] = np.inf
     return np.asarray(choices[np.argmin(cost, axis=0), np.arange(len(group))], np.intp)
 
@@ -140,8 +141,8 @@ def _connected(graph: CellGraph, shape: tuple[int, int], group: Indices) -> Indi
 
 def group_moments(graph: CellGraph, group: Indices) -> Floats:
     """[G, 11] of the groups 0 .. G - 1, and an empty one after them that stands for -1."""
-    moments = np.zeros((int(group.max(initial=-1)) + 2, graph.moments.shape[1]))
-    np.add.at(moments, group, graph.moments)
+    count = int(group.max(initial=-1)) + 2
+    moments = summed(graph.moments, np.where(group < 0, count - 1, group), count)
     moments[-1] = 0.0
     return moments
 
@@ -154,17 +155,22 @@ def _misfits(graph: CellGraph, planes: Floats) -> Floats:
 
 
 def _squares(moments: Floats, planes: Floats) -> Floats:
-    """[N] sum of squared misfits of nodes with moments [N, 11], in sigmas of their noise, for one plane [N, 3] each."""
-    n, x, y, xx, xy, yy, w, xw, yw, ww = moments.T[:NOISE]
-    a, b, c = planes.T
+    """[C, N] sum of squared misfits of nodes with moments [N, 11], in sigmas of their noise, for planes [C, N, 3]."""
+    n, x, y, xx, xy, yy, w, xw, yw, ww, noise = np.ascontiguousarray(moments.T)
+    a, b, c = np.ascontiguousarray(np.moveaxis(planes, -1, 0))
     squares = ww - 2 * (a * w + b * xw + c * yw) + a * a * n + b * b * xx + c * c * yy
     squares += 2 * (a * b * x + a * c * y + b * c * xy)
-    result: Floats = squares * n / moments[:, NOISE]
+    result: Floats = squares * (n / noise)
     return result
 
 
-def _standing_off(misfit: Floats, cell: Indices, shape: tuple[int, int]) -> list[NDArray[np.bool_]]:
-    """The connected parts of a surface's nodes, as masks [K], that stand off its plane by `misfit` [K], 1/m."""
+def _standing_off(
+    misfit: Floats, cell: Indices, shape: tuple[int, int], points: Floats, least_px: float
+) -> list[NDArray[np.bool_]]:
+    """The connected parts of a surface's nodes, as masks [K], that stand off its plane by `misfit` [K], 1/m.
+
+    points: [K] of each node; parts that have fewer than `least_px` may be left out.
+    """
     mask, image = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     mask.ravel()[cell], image.ravel()[cell] = 1.0, misfit
     window = (_WINDOW_CELLS, _WINDOW_CELLS)
@@ -172,25 +178,28 @@ def _standing_off(misfit: Floats, cell: Indices, shape: tuple[int, int]) -> list
     limit = _OFF_SIGMAS * _DEVIATION * float(np.median(np.abs(mean)))
     parts = []
     for side in (1.0, -1.0):
-        image = np.zeros(shape, np.float32)
-        image.ravel()[cell] = side * mean > limit
-        found, count = label(image, np.ones((3, 3)))
-        number = found.ravel()[cell]
-        for index in range(1, count + 1):
-            part, height = number == index, side * misfit
-            # Means reach beyond the part itself
-            parts.append(part & (height > 0.5 * np.quantile(height[part], _TYPICAL)))
+        off = side * mean > limit
+        if points[off].sum() < least_px:
+            continue
+        image = np.zeros(shape, np.uint8)
+        image.ravel()[cell] = off
+        number = cv2.connectedComponents(image, connectivity=8)[1].ravel()[cell]
+        for index in np.flatnonzero(np.bincount(number, points) >= least_px):
+            if index > 0:
+                part, height = number == index, side * misfit
+                # Means reach beyond the part itself
+                parts.append(part & (height > 0.5 * np.quantile(height[part], _TYPICAL)))
     return parts
 
 
 def _agree(pair: Floats, agreement: Agreement) -> bool:
     """Whether one plane may serve the two sets with moments [2, 11]."""
-    cost = joining_cost(pair, squared_residuals(pair), np.array([0]), np.array([1]))
-    return bool(agreement.admits(cost, pair[:1], pair[1:])[0])
+    return bool(agreement.admits(Joints.of(pair, np.array([0]), np.array([1])))[0])
 
 
-def _shifted(grid: Indices, side: tuple[int, int]) -> Indices:
-    """What stands at that side of each cell; -1 beyond the border."""
-    padded = np.pad(grid, 1, constant_values=-1)
-    row, column = side
-    return padded[1 + row : 1 + row + grid.shape[0], 1 + column : 1 + column + grid.shape[1]]
+def _around(grid: Indices) -> Indices:
+    """[4, rows * columns] what stands at the sides of each cell of a grid; -1 beyond the border."""
+    padded = np.full((grid.shape[0] + 2, grid.shape[1] + 2), -1)
+    padded[1:-1, 1:-1] = grid
+    sides = (padded[1:-1, 2:], padded[1:-1, :-2], padded[2:, 1:-1], padded[:-2, 1:-1])
+    return np.stack(sides).reshape(len(sides), -1)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tgslam.plane_fit import Floats
 from tgslam.planes.cells import CellGraph
-from tgslam.planes.moments import NOISE, joining_cost, squared_residuals
+from tgslam.planes.moments import NOISE, Joints, summed
 
 Indices = NDArray[np.intp]
 
@@ -47,18 +47,15 @@ class Agreement:
         """Three standard deviations of the shift between neighbours in sigmas; `most` if it is more or not known."""
         if not len(graph.edges):
             return most
-        first, second = graph.edges.T
-        cost = joining_cost(graph.moments, squared_residuals(graph.moments), first, second)
-        median = float(np.median(cost / np.minimum(graph.moments[first, 0], graph.moments[second, 0])))
+        median = float(np.median(graph.joints.cost / graph.joints.fewer))
         return min(_OVER_MEDIAN * float(np.sqrt(median)) / sigma, most)
 
-    def admits(self, cost: Floats, first: Floats, second: Floats) -> NDArray[np.bool_]:
-        """Whether the `joining_cost` [E], 1/m^2, of pairs of sets with those moments [E, 11] is small enough [E]."""
-        fewer = np.minimum(first[:, 0], second[:, 0])
-        inverse_depth = (first[:, 6] + second[:, 6]) / np.maximum(first[:, 0] + second[:, 0], 1.0)
-        shift = (self.shift_sigmas * self.sigma) ** 2 + (self.shift_m * inverse_depth**2) ** 2
-        variance = (first[:, NOISE] + second[:, NOISE]) / np.maximum(first[:, 0] + second[:, 0], 1.0)
-        return cost <= self.sigmas**2 * variance + self.common + shift * fewer
+    def admits(self, joints: Joints) -> NDArray[np.bool_]:
+        """Which pairs of sets [E] one plane may serve: those that it costs little enough."""
+        count = np.maximum(joints.moments[:, 0], 1.0)
+        shift = (self.shift_sigmas * self.sigma) ** 2 + (self.shift_m * (joints.moments[:, 6] / count) ** 2) ** 2
+        variance = joints.moments[:, NOISE] / count
+        return joints.cost <= self.sigmas**2 * variance + self.common + shift * joints.fewer
 
 
 def agglomerate(moments: Floats, edges: Indices, agreement: Agreement) -> tuple[Indices, Floats]:
@@ -72,13 +69,12 @@ def agglomerate(moments: Floats, edges: Indices, agreement: Agreement) -> tuple[
     group = np.arange(len(moments))
     while len(edges):
         partner = _partners(moments, edges, agreement)
-        if (partner == np.arange(len(moments))).all():
+        stays = partner == np.arange(len(moments))
+        if stays.all():
             break
-        alive, number = np.unique(_roots(partner), return_inverse=True)
-        joined = np.zeros((len(alive), moments.shape[1]))
-        np.add.at(joined, number, moments)
-        group, moments = number[group], joined
-        edges = _distinct(number[edges], len(alive))
+        number = (np.cumsum(stays) - 1)[_roots(partner)]
+        moments = summed(moments, number, int(np.count_nonzero(stays)))
+        group, edges = number[group], _distinct(number[edges], len(moments))
     return group, moments
 
 
@@ -86,9 +82,9 @@ def _partners(moments: Floats, edges: Indices, agreement: Agreement) -> Indices:
     """[N] the set that each one joins, or itself: no circles, for partners are larger, or earlier and stay."""
     size = moments[:, 0]
     first, second = edges.T
-    cost = joining_cost(moments, squared_residuals(moments), first, second)
-    allowed = agreement.admits(cost, moments[first], moments[second])
-    low, high, cost = first[allowed], second[allowed], cost[allowed]
+    joints = Joints.of(moments, first, second)
+    allowed = agreement.admits(joints)
+    low, high, cost = first[allowed], second[allowed], joints.cost[allowed]
     least = np.full(len(moments), np.inf)  # cost of the cheapest edge at each set
     np.minimum.at(least, low, cost)
     np.minimum.at(least, high, cost)

@@ -6,6 +6,8 @@ Moments [N, 10] and planes [N, 3] are those of `tgslam.plane_fit`: inverse depth
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,9 +31,8 @@ def planes_of(moments: Floats) -> Floats:
 
 
 def information(moments: Floats) -> Floats:
-    """[3, 3] normal matrix over (g0, gx, gy) of one set's moments [10]."""
-    n, x, y, xx, xy, yy = moments[:6]
-    return np.array([[n, x, y], [x, xx, xy], [y, xy, yy]])
+    """[N, 3, 3] normal matrices over (g0, gx, gy)."""
+    return moments[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
 
 
 def noise_of(moments: Floats) -> Floats:
@@ -39,25 +40,45 @@ def noise_of(moments: Floats) -> Floats:
     return np.sqrt(moments[:, NOISE] / np.maximum(moments[:, 0], 1.0))
 
 
-def width_px(moments: Floats) -> float:
-    """Of a rectangle that scatters like the points, the shorter side, in px."""
-    return float(np.sqrt(12.0 * max(np.linalg.eigvalsh(scatter(moments))[0], 0.0)))
+def width_px(moments: Floats) -> Floats:
+    """[N] of rectangles that scatter like the points, the shorter side, in px."""
+    xx, xy, _, yy = scatter(moments).reshape(-1, 4).T
+    least = 0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy)
+    return np.sqrt(12.0 * np.maximum(least, 0.0))
 
 
 def scatter(moments: Floats) -> Floats:
-    """[2, 2] px^2, covariance of the points' places in the image."""
-    n, x, y, xx, xy, yy = moments[:6]
-    return np.array([[xx - x * x / n, xy - x * y / n], [xy - x * y / n, yy - y * y / n]]) / n
+    """[N, 2, 2] px^2, covariances of the points' places in the image."""
+    n, x, y, xx, xy, yy = moments.T[:6]
+    mean_x, mean_y = x / n, y / n
+    across = xy - mean_x * y
+    return (np.stack([xx - mean_x * x, across, across, yy - mean_y * y], axis=1) / n[:, None]).reshape(-1, 2, 2)
 
 
-def joining_cost(moments: Floats, squares: Floats, first: NDArray[np.intp], second: NDArray[np.intp]) -> Floats:
-    """[E] 1/m^2: by how much the squared residuals of sets `first` and `second` [E] grow if one plane serves both.
+def summed(rows: Floats, group: NDArray[np.intp], groups: int) -> Floats:
+    """[groups, K] sums of the rows [N, K] that belong to each group [N], added in their order."""
+    return np.stack([np.bincount(group, column, groups) for column in rows.T], axis=1)
 
-    It is d^T (P_1 + P_2)^-1 d, d the difference of the two planes and P their covariances at unit noise. squares:
-    `squared_residuals` of the moments.
-    """
-    joint = squared_residuals(moments[first] + moments[second])
-    return np.maximum(joint - squares[first] - squares[second], 0.0)
+
+@dataclass(frozen=True)
+class Joints:
+    """Pairs of sets of points, each held against one plane for both of its sets."""
+
+    moments: Floats  # [E, 11] of both together
+    fewer: Floats  # [E] points of the smaller set
+    cost: Floats  # [E] 1/m^2, by how much the squared residuals grow if one plane serves both
+
+    @classmethod
+    def of(cls, moments: Floats, first: NDArray[np.intp], second: NDArray[np.intp]) -> Joints:
+        """Of the sets `first` and `second` [E] out of those with these moments [N, 11].
+
+        The cost is d^T (P_1 + P_2)^-1 d, d the difference of the two planes and P their covariances at unit noise.
+        """
+        squares, size = squared_residuals(moments), moments[:, 0]
+        both = moments.take(first, axis=0)
+        both += moments.take(second, axis=0)
+        cost = np.maximum(squared_residuals(both) - squares[first] - squares[second], 0.0)
+        return cls(both, np.minimum(size[first], size[second]), cost)
 
 
 def _fitted(moments: Floats) -> tuple[Floats, Floats, Floats]:

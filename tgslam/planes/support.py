@@ -44,6 +44,16 @@ class Support:
         """The cells [N, 2] over which points [N, 3] m lie."""
         return np.floor((points_w - self.origin) @ self.axes.T / self.cell_m).astype(np.int64)
 
+    def shows_extent(self, points: Vector, T_wc: Vector) -> NDArray[np.bool_]:
+        """Which of points [3, N] m, in the frame of T_wc [4, 4], lie over occupied cells."""
+        along = self.axes / self.cell_m
+        low = along @ (T_wc[:3, 3] - self.origin) - self._low
+        places = [
+            np.floor(a * points[0] + b * points[1] + c * points[2] + d).astype(np.intp)
+            for (a, b, c), d in zip(along @ T_wc[:3, :3], low, strict=True)
+        ]
+        return _lookup(self._evidence, *places)
+
     def centres(self, cells: Cells) -> Vector:
         """Their middles [N, 3] m, world."""
         return self.origin + (cells + 0.5) * self.cell_m @ self.axes
@@ -60,14 +70,14 @@ class Support:
 
     def holds(self, cells: Cells) -> NDArray[np.bool_]:
         """Which of the cells [N, 2] are occupied."""
-        return _lookup(self._evidence, cells - self._low)
+        return _lookup(self._evidence, *(cells - self._low).T)
 
     def near(self, cells: Cells, gap_m: float) -> NDArray[np.bool_]:
         """Which of the cells [N, 2] lie within a gap of an occupied one."""
         reach = 1 + int(gap_m / self.cell_m)  # neighbours stand one cell apart and have no gap between them
         padded = np.pad((self._evidence > 0).astype(np.uint8), reach)
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-        return _lookup(cv2.dilate(padded, kernel) if padded.size else padded, cells - self._low + reach)
+        return _lookup(cv2.dilate(padded, kernel) if padded.size else padded, *(cells - self._low + reach).T)
 
     def connects(self, cells: Cells, others: Cells) -> bool:
         """Whether occupied cells lead from one of the cells [N, 2] to one of the others, side by side."""
@@ -183,10 +193,9 @@ def _simplified(contour: NDArray[np.int32], tolerance: float) -> NDArray[np.int3
     return simple if len(simple) > 2 else contour
 
 
-def _lookup(grid: NDArray[np.uint8], index: Cells) -> NDArray[np.bool_]:
-    """Where grid[index] > 0, for index [N, 2]; False outside the grid."""
+def _lookup(grid: NDArray[np.uint8], row: NDArray[np.int64], column: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Where grid[row, column] > 0, [N] each; False outside the grid."""
     if grid.size == 0:
-        return np.zeros(len(index), bool)
-    inside: NDArray[np.bool_] = np.all((index >= 0) & (index < grid.shape), axis=1)
-    clipped = np.where(inside[:, None], index, 0)
-    return inside & (grid[clipped[:, 0], clipped[:, 1]] > 0)
+        return np.zeros(len(row), bool)
+    inside: NDArray[np.bool_] = (row >= 0) & (row < grid.shape[0]) & (column >= 0) & (column < grid.shape[1])
+    return inside & (grid.ravel()[np.where(inside, row * grid.shape[1] + column, 0)] > 0)
