@@ -26,6 +26,7 @@ _NEIGHBOUR = 6.0  # squared sigmas of misfit that a neighbour of the same surfac
 
 _LARGE = 6.0  # likewise, that the surface is large, and needs no plane of its own
 _LARGER = 4.0  # times as many points has a surface that another one is taken to be parallel to
+_MIXED_SHARE = 0.25  # of a small group's nodes, that another plane fits better: fewer are noise
 _NARROW_CELLS = 5  # wide is a strip that may seem turned by as much as surfaces stray from planes
 _FEWEST_PX = 6.0  # of what is compared
 _STEP_M = 0.1  # along the line of sight at most from one to the other
@@ -86,10 +87,12 @@ def _unmixed(graph: CellGraph, group: Indices, large_px: float) -> Indices:
         open_ = np.flatnonzero((group >= 0) & ~is_large[group])
         around = np.full((0, len(open_)), -1, np.intp)
         chosen = _choice(graph.moments[open_], group[open_], around, is_large, planes_of(moments), 0.0)
-        if (chosen == group[open_]).all():
+        left = np.bincount(group[open_][chosen != group[open_]], minlength=len(moments))
+        mixed = left > _MIXED_SHARE * np.bincount(group[open_], minlength=len(moments))
+        if not mixed.any():
             break
         group = group.copy()
-        group[open_] = chosen
+        group[open_] = np.where(mixed[group[open_]], chosen, group[open_])
     return group
 
 
