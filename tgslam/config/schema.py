@@ -224,9 +224,7 @@ class StructureConfig:
     lambda_pgi: float = setting(0.1, 0.0, 100.0)  # what E_pgi weighs for geometry; 0 = no instance field
     identity: str = setting("colour", choices=("colour", "scalar"))  # what a Gaussian carries of its plane's id
     scalar_ids: int = setting(64, 1, 100_000)  # with identity: scalar, ids that can be told apart
-    pgi_interval: int = setting(
-        3, 1, 1000
-    )  # of refinements since its ids have changed, the first and every n-th one see a keyframe's planes
+    pgi_interval: int = setting(3, 1, 1000)  # refinements of a keyframe, from one that sees its planes to the next
     charbonnier_pgi: float = setting(0.1, 1e-6, 1.0)  # epsilon of Eq. 4, colour in [0, 1]
     edge_boost: float = setting(2.0, 0.0, 100.0)  # pixels at a boundary weigh 1 + this
     weight_none: float = setting(0.5, 0.0, 1.0)  # weight of measured pixels that are on no plane
