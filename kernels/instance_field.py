@@ -160,13 +160,15 @@ def relax_embeddings(
     grad_theta: F2,  # [N, 3]
     curvature: F2,  # [N, 2] the second column: sum of blend weight times `w_embedding`
     counted: F1,  # [1] pixels that count
+    most_px: F1,  # [N] blend weight in the view that has shown the Gaussian best
     step: ti.f32,  # 1 = the full step
     floor: ti.f32,  # over the pixels that count, it is added to the curvature, so that little evidence moves little
+    share_of_most: ti.f32,  # as many such floors as this share of most_px, so that fringes move little, too
     theta: F2,  # [N, 3] changed
 ):
     """One relaxation step of sigmoid(theta), in which blending is linear: see kernels/relaxation.py."""
     for i in range(count):
-        whole = curvature[i, 1] + share(floor, counted[0])
+        whole = curvature[i, 1] + share(floor, counted[0]) * ti.max(1.0, share_of_most * most_px[i])
         if curvature[i, 1] > 0.0 and visible[i] != 0:
             for c in ti.static(range(3)):
                 colour = ti.min(ti.max(sigmoid(theta[i, c]), LOW), HIGH)

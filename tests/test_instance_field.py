@@ -122,12 +122,14 @@ def test_relaxation_matches_the_twin():
     gradient, theta = 0.02 * rng.normal(size=(n, 3)), 3 * rng.normal(size=(n, 3))
     curvature = 10.0 ** rng.uniform(-4, 0, (n, 2))
     curvature[::7, 1] = 0.0
+    most_px = 10.0 ** rng.uniform(-1, 2, n)
     moved = runtime.to_device(theta.copy())
     kernels.relax_embeddings(
         n, runtime.to_device(visible, np.int32), runtime.to_device(gradient), runtime.to_device(curvature),
-        runtime.to_device([50.0]), 0.8, 0.3, moved,
+        runtime.to_device([50.0]), runtime.to_device(most_px), 0.8, 0.3, 0.5, moved,
     )  # fmt: skip
-    expected = reference.relax(visible > 0, gradient, curvature[:, 1], 0.3 / 50.0, 0.8, theta)
+    floor = 0.3 / 50.0 * np.maximum(1.0, 0.5 * most_px)
+    expected = reference.relax(visible > 0, gradient, curvature[:, 1], floor, 0.8, theta)
     np.testing.assert_allclose(runtime.to_host(moved), expected, atol=2e-4)
     rests = (visible == 0) | (curvature[:, 1] == 0)
     np.testing.assert_array_equal(runtime.to_host(moved)[rests], np.float32(theta)[rests])

@@ -109,6 +109,7 @@ def relax(
     visible: np.ndarray,
     grad_theta: np.ndarray,
     curvature: np.ndarray,
+    most_px: np.ndarray,
     target: InstanceTarget,
     config: StructureConfig,
     theta: np.ndarray,
@@ -116,11 +117,13 @@ def relax(
     """Move the visible Gaussians' embeddings theta [N, 3], so that sigmoid(theta) takes a relaxation step.
 
     grad_theta: [N, 3] and curvature: [N, 2] of the backward pass for which `InstanceGradient.weight` was the weight of
-    the curvature's second column. The step does not depend on lambda_pgi.
+    the curvature's second column. most_px: [N] px, the most blend weight that a view has given each Gaussian. Where a
+    view shows much less of one, as of a surface without depth at a grazing angle, of whose Gaussians only the fringes
+    reach into measured pixels, they are beyond the edge: it moves little. The step does not depend on lambda_pgi.
     """
     kernels.relax_embeddings(
-        count, visible, grad_theta, curvature, target.counted, config.relaxation,
-        _ONE_PIXEL * config.lambda_pgi, theta,
+        count, visible, grad_theta, curvature, target.counted, most_px, config.relaxation,
+        _ONE_PIXEL * config.lambda_pgi, config.fringe_share, theta,
     )  # fmt: skip
 
 

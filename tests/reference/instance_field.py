@@ -32,13 +32,13 @@ def value(embedding, opacity, ids, weight, codes, config):
 
 
 def relax(visible, grad_theta, curvature, floor, step, theta):
-    """New embeddings [N, 3]; curvature: [N]."""
+    """New embeddings [N, 3]; curvature, floor: [N]."""
     theta = theta.copy()
     for i in np.flatnonzero(visible):
         if curvature[i] > 0:
             colour = np.clip(1 / (1 + np.exp(-theta[i])), LOW, HIGH)
             slope = grad_theta[i] / (colour * (1 - colour))
-            moved = np.clip(colour - step * slope / (curvature[i] + floor), LOW, HIGH)
+            moved = np.clip(colour - step * slope / (curvature[i] + floor[i]), LOW, HIGH)
             theta[i] = np.log(moved / (1 - moved))
     return theta
 

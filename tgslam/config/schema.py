@@ -167,7 +167,7 @@ class PlanesConfig:
 
     enabled: bool = setting(False)  # False: the map knows nothing of planes
     # Segments of single views (section 3.2); sigmas are of the sensor's inverse depth at a pixel
-    max_segments: int = setting(16, 1, 1000)  # K: the largest ones are kept
+    max_segments: int = setting(32, 1, 1000)  # K: the largest ones are kept
     cells_across: int = setting(80, 8, 1000)  # the image: segmentation starts from squares of at least 4 px
     cell_share: float = setting(0.5, 0.1, 1.0)  # of a cell's pixels that must be measured
     cell_sigmas: float = setting(1.4, 0.1, 100.0)  # a cell whose residual is more is not plane
@@ -225,11 +225,12 @@ class StructureConfig:
     lambda_pgi: float = setting(0.1, 0.0, 100.0)  # what E_pgi weighs for geometry; 0 = no instance field
     identity: str = setting("colour", choices=("colour", "scalar"))  # what a Gaussian carries of its plane's id
     scalar_ids: int = setting(64, 1, 100_000)  # with identity: scalar, ids that can be told apart
-    pgi_interval: int = setting(3, 1, 1000)  # a keyframe's first refinement and every n-th one after see its planes
+    pgi_interval: int = setting(3, 1, 1000)  # refinements of a keyframe, from one that sees its planes to the next
     charbonnier_pgi: float = setting(0.1, 1e-6, 1.0)  # epsilon of Eq. 4, colour in [0, 1]
     edge_boost: float = setting(2.0, 0.0, 100.0)  # pixels at a boundary weigh 1 + this
     weight_none: float = setting(0.5, 0.0, 1.0)  # weight of measured pixels that are on no plane
     relaxation: float = setting(1.0, 0.0, 1.9)  # of embeddings; 1 = the full step
+    fringe_share: float = setting(2.0, 0.0, 100.0)  # of its best view: one that shows less of a Gaussian moves it less
     read_margin: float = setting(0.05, 0.0, 1.0)  # ids are read where no other code is less than this farther
     read_opacity: float = setting(0.5, 0.01, 1.0)  # and rendered opacity is at least this
     read_distance_m: float = setting(0.05, 0.0, 10.0)  # and the rendered surface is at most this far from the plane

@@ -102,6 +102,8 @@ class Mapper:
 
     def finish(self) -> None:
         """The final pass: every keyframe in turn, in random order, poses fixed."""
+        if self.planes:
+            self.planes.complete(self.keyframes)
         for _ in range(0, self.config.final_iterations, max(len(self.keyframes), 1)):
             for k in self.rng.permutation(len(self.keyframes)):
                 self.refiner.step(self.gaussians, self.keyframes[k], move_pose=False)

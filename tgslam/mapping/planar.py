@@ -24,7 +24,7 @@ from tgslam.types import Camera
 
 _CLOSING_PX = 7  # window in which a PGI may surround a pixel
 _CLOSING_SHARE = 0.6  # of its pixels that must be the PGI's
-_GLANCE_PX = 8  # between the pixels that tell whether a keyframe shows a plane at all
+_GLANCE_PX = 4  # between the pixels that tell whether a keyframe shows a plane at all
 _AGREEMENT = 5.0  # standard deviations of sensor and model between a PGI and a measurement that counts as its
 
 
@@ -104,6 +104,14 @@ class PlanarMapping:
                 self._T_cw[number] = T_cw.copy()
         if corrections:
             self.registry.moved(corrections)
+
+    def complete(self, keyframes: Sequence[Keyframe]) -> None:
+        """Keyframes show PGIs that were confirmed, or seen in full, only after them."""
+        for keyframe in keyframes:
+            assert keyframe.plane_ids is not None
+            ids = self._completed(keyframe.plane_ids.astype(np.int32), keyframe.depth_m(), keyframe.T_cw)
+            if not np.array_equal(ids, keyframe.plane_ids):
+                keyframe.plane_ids = ids.astype(np.int16)
 
     def _correct(self, keyframe: Keyframe, plane_ids: Sequence[int]) -> None:
         """A keyframe shows PGIs, parts of which have turned out to be other ones."""

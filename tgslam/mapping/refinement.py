@@ -123,7 +123,7 @@ class Refiner:
         if self.structure:
             self.structure.regularise(gaussians, visible, gradient)
             if pgi:
-                self.structure.move_embeddings(gaussians, visible, gradient, pgi.target)
+                self.structure.move_embeddings(gaussians, visible, gradient, self._sightings, pgi.target)
         names = list(self.adam.learning_rates)
         self.adam.step(
             {name: getattr(gaussians, name) for name in names},

@@ -21,6 +21,11 @@ class Sightings:
         self._views = runtime.zeros((_MIN_CAPACITY,), np.int32)
 
     @property
+    def most_px(self) -> np.ndarray:
+        """`contribution` as the device array, with spare rows."""
+        return self._contribution
+
+    @property
     def contribution(self) -> NDArray[np.float32]:
         """[N] px on the host: since birth the most blend weight in any view."""
         return runtime.to_host(self._contribution)[: self.rows]

@@ -12,6 +12,7 @@ from tgslam.config.schema import StructureConfig
 from tgslam.gaussian_map import GaussianMap, MapGradient
 from tgslam.instance_field import InstanceGradient, InstanceTarget
 from tgslam.mapping.keyframe import Keyframe
+from tgslam.mapping.sightings import Sightings
 from tgslam.plane_regularisers import PlaneRegularisers
 from tgslam.planes.codes import code_table
 from tgslam.planes.table import PlaneTable
@@ -29,7 +30,7 @@ class StructureTerms:
         self._workspace = instance_field.Workspace(camera.height, camera.width)
         self._regularisers = PlaneRegularisers(config)
         self._targets: OrderedDict[int, tuple[NDArray[np.int16], InstanceTarget]] = OrderedDict()
-        self._visits: dict[int, int] = {}  # by keyframe
+        self._visits: dict[int, tuple[NDArray[np.int16], int]] = {}  # by keyframe, since it has had these ids
         self.set_planes(PlaneTable.empty())
 
     def set_planes(self, table: PlaneTable) -> None:
@@ -38,11 +39,15 @@ class StructureTerms:
         self.codes = runtime.to_device(code_table(table.ids, self.config))
 
     def due(self, keyframe: Keyframe) -> InstanceTarget | None:
-        """The keyframe's target, if E_pgi takes part in this step: embeddings converge in few, so not in each."""
+        """The keyframe's target, if E_pgi takes part in this step: embeddings converge in few, so not in each.
+
+        It does as soon as what the keyframe shows of planes has changed.
+        """
         if keyframe.plane_ids is None or self.config.lambda_pgi == 0.0:
             return None
-        visit = self._visits.get(keyframe.index, 0)
-        self._visits[keyframe.index] = visit + 1
+        ids, visit = self._visits.get(keyframe.index, (keyframe.plane_ids, 0))
+        visit = visit if ids is keyframe.plane_ids else 0
+        self._visits[keyframe.index] = keyframe.plane_ids, visit + 1
         return self._target(keyframe, keyframe.plane_ids) if visit % self.config.pgi_interval == 0 else None
 
     def pgi(self, rendered: RenderImages, target: InstanceTarget, g_opacity: np.ndarray) -> InstanceGradient:
@@ -57,12 +62,18 @@ class StructureTerms:
             self._regularisers.add(gaussians, visible, self._planes, gradient)
 
     def move_embeddings(
-        self, gaussians: GaussianMap, visible: np.ndarray, gradient: MapGradient, target: InstanceTarget
+        self,
+        gaussians: GaussianMap,
+        visible: np.ndarray,
+        gradient: MapGradient,
+        sightings: Sightings,
+        target: InstanceTarget,
     ) -> None:
         """Relax the embeddings; the curvature's second column must hold the weights of E_pgi."""
         instance_field.relax(
-            gaussians.count, visible, gradient.embedding, gradient.curvature, target, self.config, gaussians.embedding
-        )
+            gaussians.count, visible, gradient.embedding, gradient.curvature, sightings.most_px, target, self.config,
+            gaussians.embedding,
+        )  # fmt: skip
 
     @property
     def parts(self) -> dict[str, float]:

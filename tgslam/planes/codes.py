@@ -10,6 +10,7 @@ from tgslam.config.schema import StructureConfig
 from tgslam.planes import palette
 
 _LEAST, _MOST = 0.04, 0.96  # what a sigmoid (Eq. 1) reaches without saturating
+_NEAR_MARGINS = 2.0  # of reading: so near has to be a mixture
 _NEUTRAL = 0.5  # what embeddings of 0 show: channels that carry nothing never move
 
 
@@ -46,6 +47,24 @@ def read_ids(
     """
     ids = np.append(palette.NO_PLANE, np.asarray(known_ids, np.int64))
     return instance_field.read_ids(embedding, opacity, ids, codes_of(ids, config), _margin(config), config.read_opacity)
+
+
+def unmixed(colours: NDArray[np.floating], ids: NDArray[np.integer], config: StructureConfig) -> NDArray[np.int32]:
+    """The larger part of the mixture of two ids that comes nearest to each of the colours [N, 3], out of ids [N, K].
+
+    -1 = no plane, which may be a part as well. A mixture has to come as near as codes have to be apart.
+    """
+    code = codes_of(ids, config)
+    first, second = np.triu_indices(ids.shape[1])
+    ends = code[:, second] - code[:, first]  # [N, pairs, 3]
+    rest = colours[:, None] - code[:, first]
+    share = np.clip((rest * ends).sum(-1) / np.maximum((ends**2).sum(-1), 1e-9), 0.0, 1.0)
+    distance = np.linalg.norm(rest - share[..., None] * ends, axis=-1)
+    rows = np.arange(len(ids))
+    best = np.argmin(distance, axis=1)
+    larger = np.where(share[rows, best] > 0.5, second[best], first[best])
+    near = distance[rows, best] <= _NEAR_MARGINS * _margin(config)
+    return np.where(near, ids[rows, larger], palette.NO_PLANE).astype(np.int32)
 
 
 def _margin(config: StructureConfig) -> float:

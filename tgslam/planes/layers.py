@@ -26,6 +26,7 @@ _NEIGHBOUR = 6.0  # squared sigmas of misfit that a neighbour of the same surfac
 
 _LARGE = 6.0  # likewise, that the surface is large, and needs no plane of its own
 _LARGER = 4.0  # times as many points has a surface that another one is taken to be parallel to
+_MIXED_SHARE = 0.25  # of a small group's nodes, that another plane fits better: fewer are noise
 _NARROW_CELLS = 5  # wide is a strip that may seem turned by as much as surfaces stray from planes
 _FEWEST_PX = 6.0  # of what is compared
 _STEP_M = 0.1  # along the line of sight at most from one to the other
@@ -57,6 +58,7 @@ def settle(graph: CellGraph, shape: tuple[int, int], group: Indices, large_px: f
     It may change to the groups of its neighbours, and to all of more than `large_px` points: those go on behind things.
     Parts that are not connected are groups of their own then. -1 stays -1.
     """
+    group = _unmixed(graph, group, large_px)
     grid = np.full(shape, -1, np.intp)
     for _ in range(_ROUNDS):
         moments = group_moments(graph, group)
@@ -71,6 +73,27 @@ def settle(graph: CellGraph, shape: tuple[int, int], group: Indices, large_px: f
             break
         group = settled
     return _connected(graph, shape, group)
+
+
+def _unmixed(graph: CellGraph, group: Indices, large_px: float) -> Indices:
+    """The group [N] of each node, where those of small groups that a large one's plane fits better are that one's.
+
+    A small group that is partly on a large plane, partly a little before it, has a plane between the two that fits
+    neither, and no neighbour speaks against it where something hides how the large surface goes on.
+    """
+    for _ in range(_ROUNDS):
+        moments = group_moments(graph, group)
+        is_large = moments[:, 0] > large_px
+        open_ = np.flatnonzero((group >= 0) & ~is_large[group])
+        around = np.full((0, len(open_)), -1, np.intp)
+        chosen = _choice(graph.moments[open_], group[open_], around, is_large, planes_of(moments), 0.0)
+        left = np.bincount(group[open_][chosen != group[open_]], minlength=len(moments))
+        mixed = left > _MIXED_SHARE * np.bincount(group[open_], minlength=len(moments))
+        if not mixed.any():
+            break
+        group = group.copy()
+        group[open_] = np.where(mixed[group[open_]], chosen, group[open_])
+    return group
 
 
 def parallel(
@@ -118,7 +141,9 @@ def bordering(labels: Labels) -> Indices:
     return np.stack(np.divmod(keys, base), axis=1).astype(np.intp)
 
 
-def _choice(moments: Floats, group: Indices, around: Indices, is_large: NDArray[np.bool_], planes: Floats) -> Indices:
+def _choice(
+    moments: Floats, group: Indices, around: Indices, is_large: NDArray[np.bool_], planes: Floats, bonus: float = _LARGE
+) -> Indices:
     """The best group [K] of nodes with moments [K, 11], out of their own [K], those around [4, K] and large ones.
 
     is_large, planes: [G + 1] of each group, the last one standing for -1.
@@ -126,7 +151,7 @@ def _choice(moments: Floats, group: Indices, around: Indices, is_large: NDArray[
     large = np.flatnonzero(is_large)[:, None]
     choices = np.concatenate([group[None], around, np.broadcast_to(large, (len(large), len(group)))])
     cost = _squares(moments, planes[choices])
-    cost -= _NEIGHBOUR * (choices[:, None] == around[None]).sum(axis=1) + _LARGE * is_large[choices]
+    cost -= _NEIGHBOUR * (choices[:, None] == around[None]).sum(axis=1) + bonus * is_large[choices]
     cost[choices < 0] = np.inf
     return np.asarray(choices[np.argmin(cost, axis=0), np.arange(len(group))], np.intp)
 

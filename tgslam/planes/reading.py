@@ -14,12 +14,15 @@ from tgslam.planes.instance import NO_ID
 from tgslam.splatting.images import RenderImages
 from tgslam.types import Camera, FloatImage, Matrix4, Plane
 
+_AROUND = tuple((dy, dx) for dy in (-2, 0, 2) for dx in (-2, 0, 2) if dy or dx)  # px
+
 
 class PlaneReader:
     """Reads ids off renderings for one camera.
 
     Where two surfaces blend, the mixture may look like a third one. It is nowhere near, though, so an id holds only
-    where the rendered surface lies on its plane.
+    where the rendered surface lies on its plane; and what remains undecided is held against mixtures of what the pixels
+    around show.
     """
 
     def __init__(
@@ -34,7 +37,27 @@ class PlaneReader:
         """The plane [H, W] that each pixel shows, -1 = none. images: a rendering from T_cw with its embedding."""
         ids = codes.read_ids(images.embedding, images.opacity, [plane.id for plane in self.planes], self.config)
         opacity = np.maximum(runtime.to_host(images.opacity), np.float32(1e-3))
-        return self.on_planes(ids, runtime.to_host(images.depth) / opacity, T_cw)
+        depth_m = runtime.to_host(images.depth) / opacity
+        ids = self.on_planes(ids, depth_m, T_cw)
+        colours = runtime.to_host(images.embedding) / opacity[..., None]
+        mixed = self._unmixed(ids, colours, opacity >= self.config.read_opacity)
+        return self.on_planes(mixed, depth_m, T_cw)
+
+    def _unmixed(self, ids: NDArray[np.int32], colours: FloatImage, covered: NDArray[np.bool_]) -> NDArray[np.int32]:
+        """The ids [H, W], where those that are -1 but covered have what most of a mixture is that explains the colour.
+
+        A pixel at an edge shows two surfaces, or one and what is no plane: one of the pixels around shows each of them
+        by itself. colours: [H, W, 3] embeddings over opacity.
+        """
+        rows, columns = np.nonzero((ids == NO_ID) & covered)
+        height, width = ids.shape
+        around = [ids[np.clip(rows + dy, 0, height - 1), np.clip(columns + dx, 0, width - 1)] for dy, dx in _AROUND]
+        nearby = np.sort(np.stack([*around, np.full(len(rows), NO_ID, np.int32)], axis=1), axis=1)
+        beside = nearby[:, -1] != NO_ID
+        rows, columns, nearby = rows[beside], columns[beside], nearby[beside]
+        result = ids.copy()
+        result[rows, columns] = codes.unmixed(colours[rows, columns], nearby, self.config)
+        return result
 
     def on_planes(self, ids: NDArray[np.int32], depth_m: FloatImage, T_cw: Matrix4) -> NDArray[np.int32]:
         """The ids [H, W] but for those pixels whose surface, at depth_m [H, W] m, is not on their plane: -1."""

@@ -40,8 +40,9 @@ def relaxed(count: int = 300) -> dict[str, np.ndarray]:
     target = instance_field.prepare(ids, runtime.to_device(depth), CONFIG)
     visible = runtime.to_device(rng.integers(0, 3, count), np.int32)
     gradient, curvature = 0.01 * rng.normal(size=(count, 3)), 10.0 ** rng.uniform(-3, 0, (count, 2))
+    most_px = runtime.to_device(10.0 ** rng.uniform(-1, 2, count))
     instance_field.relax(
-        count, visible, runtime.to_device(gradient), runtime.to_device(curvature), target, CONFIG, theta
+        count, visible, runtime.to_device(gradient), runtime.to_device(curvature), most_px, target, CONFIG, theta
     )
     return {"theta": runtime.to_host(theta)}
 

@@ -105,6 +105,7 @@ class _Learning:
         self._workspace = instance_field.Workspace(camera.height, camera.width)
         self._target = instance_field.prepare(ids, runtime.to_device(frame.depth_m), config)
         self._gradient = MapGradient.zeros(self._map.capacity)
+        self._most_px = runtime.zeros((self._map.capacity,))  # it is the only view
         self._g_opacity = runtime.zeros((camera.height, camera.width))
         self._no_colour = runtime.zeros((camera.height, camera.width, 3))
         self._no_depth = runtime.zeros((camera.height, camera.width))
@@ -134,6 +135,6 @@ class _Learning:
         self._rasterizer.backward(self._map, g, self._gradient)
         instance_field.relax(
             self._map.count, self._rasterizer.tile_count, self._gradient.embedding, self._gradient.curvature,
-            self._target, self._config, self._map.embedding,
+            self._most_px, self._target, self._config, self._map.embedding,
         )  # fmt: skip
         return pgi.value
