@@ -214,7 +214,9 @@ def add_residuals(
     # at the map's rim colours fade into black: a pull that does not depend on the pose
     firm = indicator(filled(z, 0.0), surface_depth)
     # depth: e is the length of the residual, whose sign is the distance's
-    sensor = settings[DEPTH_SIGMA] * depth * depth
+    # by the model's depth: by the measured one, what errs towards the camera would count for more
+    expected = larger(model_depth, filled(z, MIN_DEPTH_M))
+    sensor = settings[DEPTH_SIGMA] * expected * expected
     has_normal = indicator(filled(z, 0.5), nx * nx + ny * ny + nz * nz)
     length = ti.sqrt(ray_x * ray_x + ray_y * ray_y + 1.0)
     cosine = larger((0.0 - (nx * ray_x + ny * ray_y + nz)) / length, filled(length, _MIN_COSINE))

@@ -56,16 +56,19 @@ def mean_luma(colour: ti.template(), i, j, size: ti.template()):
 
 @ti.func
 def mean_of_nearest(z, relative):
-    """Mean of those measurements of a vector (m, 0 = none) that lie on its nearest surface; 0 where it has none."""
+    """Mean of those measurements of a vector (m, 0 = none) that lie on its nearest surface; 0 where it has none.
+
+    It is the inverse depth that is averaged, which on a plane is that of the centre: slanted surfaces do not recede.
+    """
     nearest = 1e30
     for k in ti.static(range(z.n)):
         nearest = ti.min(nearest, ti.select(z[k] > 0.0, z[k], 1e30))
     total, count = 0.0, 0.0
     for k in ti.static(range(z.n)):
         keep = ti.select((z[k] > 0.0) and (z[k] <= nearest * (1.0 + relative)), 1.0, 0.0)
-        total += keep * z[k]
+        total += keep / ti.max(z[k], 1e-6)
         count += keep
-    return total / ti.max(count, 1.0)
+    return count / ti.max(total, 1e-9)
 
 
 @ti.func

@@ -90,15 +90,20 @@ def test_samples_are_means_over_blocks_of_the_wanted_size() -> None:
         found, width_px = sample(depth_pyramid(depth_m, 3), u, v, np.array([size_px]))
         side = 2**level
         row, column = 6 // side * side, 13 // side * side
-        assert found[0] == pytest.approx(depth_m[row : row + side, column : column + side].mean(), abs=1e-6)
+        assert found[0] == pytest.approx(inverse_mean(depth_m[row : row + side, column : column + side]), abs=1e-6)
         assert width_px[0] == side
+
+
+def inverse_mean(depth_m: NDArray[np.float32]) -> float:
+    """Of inverse depth, which is affine on a plane."""
+    return float(1.0 / np.mean(1.0 / depth_m.astype(np.float64)))
 
 
 def test_every_sample_has_its_own_level() -> None:
     depth_m = np.arange(64, dtype=np.float32).reshape(8, 8) * np.float32(0.001) + 2
     u, v = at((5, 2), (5, 2), (0, 7))
     found, width_px = sample(depth_pyramid(depth_m, 3), u, v, np.array([4.5, 1.0, 2.5]))
-    expected = [depth_m[0:4, 4:8].mean(), depth_m[2, 5], depth_m[6:8, 0:2].mean()]
+    expected = [inverse_mean(depth_m[0:4, 4:8]), depth_m[2, 5], inverse_mean(depth_m[6:8, 0:2])]
     np.testing.assert_allclose(found, expected, atol=1e-6)
     np.testing.assert_array_equal(width_px, [4, 1, 2])
 
@@ -110,7 +115,7 @@ def test_images_of_odd_size_can_be_sampled_to_their_last_pixel() -> None:
     assert [image.shape for image in pyramid] == [(13, 7), (6, 3), (3, 1)]
     found, _ = sample(pyramid, *at((6, 12), (6, 12), (6, 12)), np.array([1.0, 2.5, 5.0]))
     # what the halvings leave out belongs to the last block
-    np.testing.assert_allclose(found, [2.02, 2.02, depth_m[8:12, 0:4].mean()], atol=1e-6)
+    np.testing.assert_allclose(found, [2.02, 2.02, inverse_mean(depth_m[8:12, 0:4])], atol=1e-6)
 
 
 def test_the_pyramid_ends_where_nothing_is_left_to_halve() -> None:

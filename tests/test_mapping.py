@@ -13,6 +13,7 @@ from tgslam.config.schema import LossConfig, MappingConfig, SeedingConfig, Synth
 from tgslam.datasets.synthetic import SyntheticSource
 from tgslam.evaluation.images import psnr
 from tgslam.geometry import inverse, se3_exp, se3_log, transform_points
+from tgslam.kernels.simd import ALPHA_MIN
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.mapper import Mapper
 from tgslam.mapping.refinement import Refiner
@@ -444,7 +445,9 @@ def test_a_common_motion_of_all_keyframes_changes_no_view_and_refines_nothing(so
     views = mapper.refiner.views.copy()
     mapper.follow(dict.fromkeys(range(3), se3_exp([0.1, -0.2, 0.3, 1.0, 0.5, -2.0])))
     for was, k in zip(before, mapper.keyframes, strict=True):
-        np.testing.assert_allclose(view(mapper, k.T_cw).colour, was, atol=2e-3)
+        change = np.abs(view(mapper, k.T_cw).colour - was)
+        # by rounding, a splat at the threshold of what is drawn may come or go
+        assert change.max() < ALPHA_MIN and np.quantile(change, 0.999) < 1e-4
     np.testing.assert_array_equal(mapper.refiner.views, views)
 
 

@@ -57,7 +57,7 @@ def ate_cm(trajectory: Trajectory, source: RgbdSource) -> float:
 
 def held_out_psnr(played: Played, source: RgbdSource) -> float:
     """Over frames that are no keyframes; the reports are of all frames of the source from its first."""
-    poses = held_out_poses(played.reports, played.slam.trajectory(), interval=5)
+    poses = held_out_poses(played.reports, played.slam.trajectory(), interval=3)
     scores = image_metrics(source, poses, played.slam.gaussians(), Rasterizer(source.camera).render)
     assert scores["heldout_frames"] >= 3
     return scores["psnr_db"]

@@ -91,8 +91,8 @@ def halve_pair(grey: np.ndarray, depth_m: np.ndarray, half_grey: np.ndarray, hal
 def halve_depth(depth_m: np.ndarray, relative: float = DEPTH_EDGE, out: np.ndarray | None = None) -> np.ndarray:
     """Half-size depth: float32 [H, W] in m, 0 = none -> [H // 2, W // 2].
 
-    Each 2x2 block gives the mean of its measurements within `relative` of the nearest one, so surfaces never mix;
-    a block without measurements gives 0.
+    Each 2x2 block gives the mean, in inverse depth, of its measurements within `relative` of the nearest one, so that
+    surfaces never mix; a block without measurements gives 0.
     """
     require("depth_m", depth_m, (None, None))
     out = _output(out, halved(depth_m.shape))

@@ -96,7 +96,7 @@ def pixel(s, T_ml, live, model, u, v):
         return None
     n = model["normal"][vn, un]
     distance, cosine = n @ (x - back_project(s, un, vn, zm)), max(-n @ ray / np.linalg.norm(ray), MIN_COSINE)
-    sensor = s.depth_sigma * z**2
+    sensor = s.depth_sigma * zm**2
     along = abs(distance) / cosine if n.any() else abs(x[2] - zm)
     if along >= s.max_distance_sigmas * sensor:
         return Pixel(matched=False)

@@ -19,7 +19,7 @@ def halve_depth(depth, relative):
         block = depth[2 * i : 2 * i + 2, 2 * j : 2 * j + 2]
         found = block[block > 0]
         if len(found):
-            half[i, j] = found[found <= found.min() * (1 + relative)].mean()
+            half[i, j] = 1 / (1 / found[found <= found.min() * (1 + relative)]).mean()
     return half
 
 

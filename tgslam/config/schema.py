@@ -87,7 +87,7 @@ class TrackingConfig:
     weight_depth: float = setting(1.0, 0.0, 100.0)
     weight_colour: float = setting(0.3, 0.0, 100.0)
     weight_gradient: float = setting(0.3, 0.0, 100.0)
-    correlated_px: float = setting(300.0, 1.0, 1e6)  # neighbouring pixels err alike: so many inform like one
+    correlated_px: float = setting(100.0, 1.0, 1e6)  # neighbouring pixels err alike: so many inform like one
     # What hands do within a frame, where pixels do not say: the last velocity, but for these standard deviations
     acceleration_m: float = setting(2.0, 0.01, 1e4)  # m/s^2
     acceleration_rad: float = setting(20.0, 0.01, 1e4)  # rad/s^2
@@ -125,7 +125,7 @@ class SeedingConfig:
     cells_across: int = setting(
         80, 1, 10_000
     )  # the image, about so many of the largest cells: doublings of the smallest
-    plane_cells_across: int = setting(80, 1, 10_000)  # likewise on one plane (PGI)
+    plane_cells_across: int = setting(40, 1, 10_000)  # likewise on one plane (PGI)
     plain_colour_std: float = setting(0.015, 0.0, 1.0)  # a cell whose channels vary less has no texture
     plane_colour_std: float = setting(0.015, 0.0, 1.0)  # likewise for a cell on one plane, but for a linear trend
     planar_sigmas: float = setting(2.0, 0.0, 100.0)  # a cell whose plane residual is less, in sensor sigmas, is flat
