@@ -142,6 +142,26 @@ def test_keyframes_before_a_plane_was_confirmed_show_it_too() -> None:
     assert np.mean(keyframes[0].plane_ids[masks[0]] == board) > 0.6
 
 
+def test_keyframes_show_in_the_end_what_only_later_ones_have_seen_of_a_plane() -> None:
+    mapping, keyframes = PlanarMapping(CAMERA, CONFIG, DEPTH_SIGMA_PER_M2), []
+    speck = np.zeros((CAMERA.height, CAMERA.width), bool)
+    speck[110:122, 240:252] = True
+    for index, T_cw in enumerate(ALONG[:3]):
+        depth_m, _ = measured([WALL], T_cw, index)
+        if index == 0:  # nothing of the right half but a speck, which is less than a segment
+            depth_m[:, 150:][~speck[:, 150:]] = 0.0
+        keyframes.append(SimpleNamespace(T_cw=T_cw, depth_m=lambda depth_m=depth_m: depth_m, plane_ids=None))
+        mapping.observe(keyframes)
+    (wall,) = mapping.instances
+    first, later = keyframes[0].plane_ids, keyframes[1].plane_ids
+    assert (first[speck] == -1).all()
+    mapping.complete(keyframes)
+    assert np.mean(keyframes[0].plane_ids[speck] == wall) > 0.9
+    known = (first >= 0) | (keyframes[0].depth_m() == 0)
+    np.testing.assert_array_equal(keyframes[0].plane_ids[known], first[known])
+    assert keyframes[1].plane_ids is later  # nothing to tell
+
+
 def test_bordering_labels_are_listed_in_both_orders() -> None:
     labels = np.array([[0, 0, 1], [-1, 2, 1]], np.int32)
     assert bordering(labels).tolist() == [[0, 1], [0, 2], [1, 0], [1, 2], [2, 0], [2, 1]]
