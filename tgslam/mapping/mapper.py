@@ -128,8 +128,7 @@ class Mapper:
         if not self.planes:
             return None
         pixels = self.planes.observe(self.keyframes)
-        if self.refiner.structure:
-            self.refiner.structure.set_planes(self.planes.table())
+        self.refiner.set_planes(self.planes.table())
         return pixels
 
     def _insert(self, keyframe: Keyframe, planes: PlanarPixels | None) -> None:
