@@ -24,7 +24,7 @@ from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.mapper import Mapper
 from tgslam.mapping.refinement import Refiner
 from tgslam.mapping.surface import Projection
-from tgslam.planes.codes import read_ids
+from tgslam.planes.codes import codes_of, read_ids
 from tgslam.render import Rasterizer
 from tgslam.stopwatch import Stopwatch
 from tgslam.synthetic import sensor
@@ -264,6 +264,20 @@ def test_gaussians_that_have_faded_or_are_not_finite_go(source: SyntheticSource)
     assert count - 20 < mapper.gaussians.count <= count - 15
     assert np.isfinite(mapper.gaussians.host("mean")).all()
     assert_rows_agree(mapper)
+
+
+@pytest.mark.parametrize("identity", ["colour", "scalar"])
+def test_new_gaussians_show_the_identity_of_their_plane(source: SyntheticSource, identity: str) -> None:
+    structure, rng = StructureConfig(identity=identity), np.random.default_rng(0)
+    config, planes = MappingConfig(iterations=0), PlanesConfig(enabled=True)
+    mapper = Mapper(source.camera, config, SeedingConfig(), LossConfig(), rng, planes, structure)
+    mapper.add_keyframe(keyframe(source, source.read(0)))
+    ids = mapper.gaussians.host("plane_id")
+    assert len(np.unique(ids)) > 3
+    shown = 1.0 / (1.0 + np.exp(-mapper.gaussians.host("embedding")))
+    assert (
+        np.isclose(shown, codes_of(ids, structure), atol=0.021).all(axis=1).mean() > 0.97
+    )  # `label` has another look at rims
 
 
 # Refinement
