@@ -128,11 +128,44 @@ def test_relaxation_matches_the_twin():
         n, runtime.to_device(visible, np.int32), runtime.to_device(gradient), runtime.to_device(curvature),
         runtime.to_device([50.0]), runtime.to_device(most_px), 0.8, 0.3, 0.5, moved,
     )  # fmt: skip
-    floor = 0.3 / 50.0 * np.maximum(1.0, 0.5 * most_px)
-    expected = reference.relax(visible > 0, gradient, curvature[:, 1], floor, 0.8, theta)
+    expected = reference.relax(visible > 0, gradient, curvature[:, 1], 50.0, most_px, 0.8, 0.3, 0.5, theta)
     np.testing.assert_allclose(runtime.to_host(moved), expected, atol=2e-4)
     rests = (visible == 0) | (curvature[:, 1] == 0)
     np.testing.assert_array_equal(runtime.to_host(moved)[rests], np.float32(theta)[rests])
+
+
+def looked_at(theta, covered_px, plane_id, most_px, config):
+    """The embedding after a view of 400 pixels, in which a Gaussian is that plane's in all the pixels it covers."""
+    colour = 1 / (1 + np.exp(-theta))
+    ids = np.full((20, 20), plane_id, np.int32)
+    codes = code_table(np.arange(8), config)
+    embedding = codes[ids + 1].astype(float)
+    embedding.reshape(-1, 3)[:covered_px] = colour
+    found, target, _ = evaluate([embedding, np.ones(ids.shape)], ids, np.ones(ids.shape, np.float32), codes, config)
+    gradient = runtime.to_host(found.embedding).reshape(-1, 3)[:covered_px].sum(axis=0) * colour * (1 - colour)
+    weight = runtime.to_host(found.weight).ravel()[:covered_px].sum()
+    moved = runtime.to_device(theta[None])
+    instance_field.relax(
+        1, runtime.to_device([1], np.int32), runtime.to_device(gradient[None]), runtime.to_device([[0.0, weight]]),
+        runtime.to_device([most_px]), target, config, moved,
+    )  # fmt: skip
+    return runtime.to_host(moved)[0].astype(float)
+
+
+@pytest.mark.parametrize(("fringe_share", "expected"), [(CONFIG.fringe_share, 3), (0.0, 7)])
+def test_views_of_a_fringe_do_not_overwrite_what_a_good_view_has_told(fringe_share, expected):
+    config = replace(CONFIG, fringe_share=fringe_share)
+
+    def shown(theta):
+        return palette.ids_of(1 / (1 + np.exp(-theta[None])), np.arange(8), CONFIG.read_margin)[0]
+
+    theta = instance_field.theta_of(codes_of([3], config))[0].astype(float)
+    for _ in range(10):
+        theta = looked_at(theta, 3, 7, 100.0, config)
+    assert shown(theta) == expected
+    for _ in range(3):  # a view as good as the best one is believed
+        theta = looked_at(theta, 100, 5, 100.0, config)
+    assert shown(theta) == 5
 
 
 def test_embeddings_of_new_gaussians_show_their_code():

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tgslam.config.schema import LossConfig, MappingConfig, SeedingConfig, SyntheticConfig
+from tgslam.config.schema import (
+    LossConfig,
+    MappingConfig,
+    PlanesConfig,
+    SeedingConfig,
+    StructureConfig,
+    SyntheticConfig,
+)
 from tgslam.datasets.synthetic import SyntheticSource
 from tgslam.evaluation.images import psnr
 from tgslam.geometry import inverse, se3_exp, se3_log, transform_points
@@ -18,6 +25,7 @@ from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.mapper import Mapper
 from tgslam.mapping.refinement import Refiner
 from tgslam.mapping.surface import Projection
+from tgslam.planes.codes import codes_of, read_ids
 from tgslam.render import Rasterizer
 from tgslam.stopwatch import Stopwatch
 from tgslam.synthetic import sensor
@@ -259,6 +267,20 @@ def test_gaussians_that_have_faded_or_are_not_finite_go(source: SyntheticSource)
     assert_rows_agree(mapper)
 
 
+@pytest.mark.parametrize("identity", ["colour", "scalar"])
+def test_new_gaussians_show_the_identity_of_their_plane(source: SyntheticSource, identity: str) -> None:
+    structure, rng = StructureConfig(identity=identity), np.random.default_rng(0)
+    config, planes = MappingConfig(iterations=0), PlanesConfig(enabled=True)
+    mapper = Mapper(source.camera, config, SeedingConfig(), LossConfig(), rng, planes, structure)
+    mapper.add_keyframe(keyframe(source, source.read(0)))
+    ids = mapper.gaussians.host("plane_id")
+    assert len(np.unique(ids)) > 3
+    shown = 1.0 / (1.0 + np.exp(-mapper.gaussians.host("embedding")))
+    assert (
+        np.isclose(shown, codes_of(ids, structure), atol=0.021).all(axis=1).mean() > 0.97
+    )  # `label` has another look at rims
+
+
 # Refinement
 
 
@@ -298,6 +320,26 @@ def test_the_final_refinement_sharpens_frames_that_mapping_never_saw(source: Syn
 def unseen_psnr(mapper: Mapper, source: SyntheticSource) -> float:
     frames = [source.clean(index) for index in (5, 15)]
     return float(np.mean([psnr(view(mapper, true_T_cw(source, f.index)).colour, f.colour) for f in frames]))
+
+
+def test_the_final_refinement_learns_what_keyframes_show_of_planes_in_the_end(source: SyntheticSource) -> None:
+    structure, rng = StructureConfig(pgi_interval=1), np.random.default_rng(0)
+    config, planes = MappingConfig(iterations=0, final_iterations=8), PlanesConfig(enabled=True)
+    mapper = Mapper(source.camera, config, SeedingConfig(), LossConfig(), rng, planes, structure)
+    for index in (0, 10):
+        mapper.add_keyframe(keyframe(source, source.read(index)))
+    first, second = mapper.keyframes
+    shown = first.plane_ids
+    assert shown is not None
+    # As if neither the keyframes' own segments had said anything, nor the Gaussians been born with an identity
+    first.plane_ids = second.plane_ids = np.full_like(shown, -1)
+    mapper.gaussians.write("embedding", slice(0, mapper.gaussians.count), np.zeros((mapper.gaussians.count, 3)))
+    mapper.finish()
+    planar = shown >= 0
+    assert (first.plane_ids[planar] == shown[planar]).mean() > 0.95
+    images = mapper.refiner.rasterizer.forward(mapper.gaussians, first.T_cw, with_embedding=True)
+    found = read_ids(images.embedding, images.opacity, np.unique(shown[planar]), structure)
+    assert (found[planar] == shown[planar]).mean() > 0.8
 
 
 def test_the_final_refinement_can_be_off(source: SyntheticSource) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tgslam import runtime
 from tgslam.config.schema import (
     LossConfig,
     MappingConfig,
@@ -21,6 +22,7 @@ from tgslam.geometry import inverse
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.refinement import Refiner
 from tgslam.mapping.seeding import quadtree, seed
+from tgslam.planes import palette
 from tgslam.planes.codes import codes_of, initial_theta, read_ids
 from tgslam.planes.registry import PlaneRegistry
 from tgslam.planes.table import PlaneTable
@@ -59,6 +61,12 @@ def seeded(source: SyntheticSource) -> GaussianMap:
     gaussians = seed(cells, np.zeros((120, 160, 3)), source.camera, view.T_cw, 0, SeedingConfig())
     ids = source.labels(0)[np.rint(cells.v).astype(int), np.rint(cells.u).astype(int)]
     return GaussianMap.from_gaussians(replace(gaussians, plane_id=ids))
+
+
+def change_ids(view: Keyframe) -> None:
+    """A plane turns out to be none."""
+    assert view.plane_ids is not None
+    view.plane_ids = np.where(view.plane_ids == 0, np.int16(-1), view.plane_ids)
 
 
 def refined(
@@ -132,9 +140,42 @@ def test_a_keyframe_with_new_ids_is_prepared_anew(source: SyntheticSource) -> No
     assert terms is not None
     before, again = terms.due(view), terms.due(view)
     assert before is again
-    assert view.plane_ids is not None
-    view.plane_ids = np.where(view.plane_ids == 0, np.int16(-1), view.plane_ids)
+    change_ids(view)
     assert terms.due(view) is not before
+
+
+def test_a_keyframe_with_new_ids_takes_part_in_its_next_refinement(source: SyntheticSource) -> None:
+    refiner = Refiner(source.camera, MappingConfig(), LossConfig(), structure=replace(CONFIG, pgi_interval=3))
+    terms, view, other = refiner.structure, true_keyframe(source, 0), true_keyframe(source, VIEWS[1])
+    assert terms is not None
+    assert [terms.due(v) is not None for v in (view, other, view, other)] == [True, True, False, False]
+    change_ids(view)
+    target = terms.due(view)
+    assert target is not None
+    np.testing.assert_array_equal(runtime.to_host(target.ids), view.plane_ids)
+    assert [terms.due(view) is not None for _ in range(3)] == [False, False, True]  # counted from there
+    assert [terms.due(other) is not None for _ in range(2)] == [False, True]  # the others keep their turn
+
+
+def taken_over(source: SyntheticSource, config: StructureConfig, plane: int) -> float:
+    """Share of a plane's Gaussians that lose its identity to a view that measures no depth on it, but all around."""
+    gaussians, refiner = refined(source, config, 0)
+    gaussians.write("embedding", slice(0, gaussians.count), initial_theta(gaussians.host("plane_id"), config))
+    frame, labels = source.read(0), source.labels(0)
+    around = replace(frame, index=1, depth_m=np.where(labels == plane, np.float32(0.0), frame.depth_m))
+    blind = Keyframe.from_frame(around, np.eye(4), Exposure(), np.eye(6))
+    blind.plane_ids = np.where(labels == plane, -1, labels).astype(np.int16)
+    for view in (true_keyframe(source, 0), blind, blind):
+        refiner.step(gaussians, view, move_pose=False)
+    colours = 1.0 / (1.0 + np.exp(-gaussians.host("embedding")[gaussians.host("plane_id") == plane]))
+    return float(np.mean(palette.ids_of(colours, np.unique(labels[labels >= 0]), CONFIG.read_margin) != plane))
+
+
+def test_a_view_that_shows_only_the_fringe_of_a_plane_takes_less_of_it_over(source: SyntheticSource) -> None:
+    config = replace(CONFIG, pgi_interval=1)
+    damped, undamped = (taken_over(source, replace(config, fringe_share=s), 1) for s in (config.fringe_share, 0.0))
+    assert undamped > 0.15
+    assert damped < 0.7 * undamped
 
 
 def test_new_gaussians_show_their_plane_at_once(source: SyntheticSource) -> None:

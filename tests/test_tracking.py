@@ -378,7 +378,9 @@ def test_the_information_is_how_the_cost_grows_with_the_pose():
     result = exact_tracker(scene, config).track(frame, None, T_mw, Exposure())
     loss = LossConfig()
     live = live_images(LivePyramid(TINY, 0, 1, loss).update(frame)[0])
-    model = model_images(ModelPyramid(TINY, 0, 1, loss, CONFIG.min_opacity, CONFIG.rim_opacity).update(scene.forward(None, T_mw))[0])
+    model = model_images(
+        ModelPyramid(TINY, 0, 1, loss, CONFIG.min_opacity, CONFIG.rim_opacity).update(scene.forward(None, T_mw))[0]
+    )
     settings = reference.Settings(
         TINY.fx, TINY.fy, TINY.cx, TINY.cy, result.exposure.gain, result.exposure.bias,
         loss.depth_sigma_per_m2, CONFIG.max_distance_sigmas, loss.charbonnier_depth_sigmas, loss.gate_depth_boost,

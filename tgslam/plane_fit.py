@@ -19,6 +19,7 @@ from tgslam.types import Camera
 
 Floats = NDArray[np.float64]
 Labels = NDArray[np.int32]
+Indices = NDArray[np.intp]
 
 FEWEST_PX = 4  # a side of a cell: with fewer, noise hides what shape it has
 
@@ -54,13 +55,13 @@ class CellGrid:
 class SegmentSums:
     """Sums over the pixels that a plane has in a cell: R rows, one for each plane and cell that share any."""
 
-    plane: NDArray[np.intp]  # [R] index
-    cell: NDArray[np.intp]  # [R] index
+    plane: Indices  # [R] index
+    cell: Indices  # [R] index
     moments: Floats  # [R, 10] robustly weighted; in place of w the misfit, 1/m
     pixels: Floats  # [R]
     squares: Floats  # [R] 1/m^2, sum of squared misfits, not weighted
 
-    def rows(self, chosen: NDArray[np.intp]) -> SegmentSums:
+    def rows(self, chosen: Indices) -> SegmentSums:
         """Some of them."""
         return SegmentSums(
             self.plane[chosen], self.cell[chosen], self.moments[chosen], self.pixels[chosen], self.squares[chosen]

@@ -31,14 +31,19 @@ def value(embedding, opacity, ids, weight, codes, config):
     return config.lambda_pgi * total / counted if counted else 0.0
 
 
-def relax(visible, grad_theta, curvature, floor, step, theta):
-    """New embeddings [N, 3]; curvature, floor: [N]."""
+def relax(visible, grad_theta, curvature, counted, most_px, step, floor, share_of_most, theta):
+    """New embeddings [N, 3]; curvature, most_px: [N].
+
+    A view moves a Gaussian as if so many pixels, floor each, had shown it as it is: one, or share_of_most of the most
+    that any view has shown of it.
+    """
     theta = theta.copy()
     for i in np.flatnonzero(visible):
         if curvature[i] > 0:
+            rests = floor / counted * max(1.0, share_of_most * most_px[i])
             colour = np.clip(1 / (1 + np.exp(-theta[i])), LOW, HIGH)
             slope = grad_theta[i] / (colour * (1 - colour))
-            moved = np.clip(colour - step * slope / (curvature[i] + floor[i]), LOW, HIGH)
+            moved = np.clip(colour - step * slope / (curvature[i] + rests), LOW, HIGH)
             theta[i] = np.log(moved / (1 - moved))
     return theta
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -128,8 +129,7 @@ class Mapper:
         if not self.planes:
             return None
         pixels = self.planes.observe(self.keyframes)
-        if self.refiner.structure:
-            self.refiner.structure.set_planes(self.planes.table())
+        self.refiner.set_planes(self.planes.table())
         return pixels
 
     def _insert(self, keyframe: Keyframe, planes: PlanarPixels | None) -> None:
@@ -148,6 +148,8 @@ class Mapper:
         cells = quadtree(colour, depth_m, wanted, self.seeding, self.loss.depth_sigma_per_m2, ids)
         born = len(self.keyframes) - 1
         new = seed(cells, normals_c, self.camera, keyframe.T_cw, born, self.seeding, ids)
+        if self.refiner.structure:
+            new = replace(new, embedding=self.refiner.structure.initial_embedding(new.plane_id))
         guessed = measured_m[np.rint(cells.v).astype(int), np.rint(cells.u).astype(int)] <= 0
         information = np.where(guessed, 0.0, cells.size_px**2 / self._sigma_m(cells.depth_m) ** 2)
         self._append(new, guessed, information)

@@ -65,7 +65,7 @@ class PlanarMapping:
         observation = self.registry.observe(view, depth_m, self.camera, keyframe.T_cw, number)
         for earlier in keyframes[:-1]:
             self._correct(earlier, observation.corrected)
-            self._complete(earlier, observation.created)
+            self._show_new(earlier, observation.created)
         ids = self._completed(self._closed(observation.id_image(view.labels)), depth_m, keyframe.T_cw)
         pixels = self._pixels(ids, depth_m, keyframe.T_cw)
         keyframe.plane_ids = pixels.ids.astype(np.int16)
@@ -109,9 +109,7 @@ class PlanarMapping:
         """Keyframes show PGIs that were confirmed, or seen in full, only after them."""
         for keyframe in keyframes:
             assert keyframe.plane_ids is not None
-            ids = self._completed(keyframe.plane_ids.astype(np.int32), keyframe.depth_m(), keyframe.T_cw)
-            if not np.array_equal(ids, keyframe.plane_ids):
-                keyframe.plane_ids = ids.astype(np.int16)
+            _show(keyframe, self._completed(keyframe.plane_ids.astype(np.int32), keyframe.depth_m(), keyframe.T_cw))
 
     def _correct(self, keyframe: Keyframe, plane_ids: Sequence[int]) -> None:
         """A keyframe shows PGIs, parts of which have turned out to be other ones."""
@@ -119,11 +117,9 @@ class PlanarMapping:
         shown = [plane_id for plane_id in plane_ids if (keyframe.plane_ids == plane_id).any()]
         if shown:
             extents = self._extents(keyframe.depth_m(), keyframe.T_cw)
-            ids = self._divided(keyframe.plane_ids.astype(np.int32), shown, extents)
-            if not np.array_equal(ids, keyframe.plane_ids):
-                keyframe.plane_ids = ids.astype(np.int16)
+            _show(keyframe, self._divided(keyframe.plane_ids.astype(np.int32), shown, extents))
 
-    def _complete(self, keyframe: Keyframe, plane_ids: Sequence[int]) -> None:
+    def _show_new(self, keyframe: Keyframe, plane_ids: Sequence[int]) -> None:
         """A keyframe may show PGIs that only later ones have confirmed."""
         assert keyframe.plane_ids is not None
         new = {i: self.instances[i] for i in plane_ids if i in self.instances}
@@ -192,6 +188,13 @@ class PlanarMapping:
         filled: NDArray[np.int32] = ids.copy()
         filled[fill] = known[highest[fill] - 1]
         return filled
+
+
+def _show(keyframe: Keyframe, ids: NDArray[np.int32]) -> None:
+    """Tell a keyframe its PGIs [H, W]. Its array stays if nothing is new, and with it what was prepared from that."""
+    assert keyframe.plane_ids is not None
+    if not np.array_equal(ids, keyframe.plane_ids):
+        keyframe.plane_ids = ids.astype(np.int16)
 
 
 def _named(ids: NDArray[np.int32]) -> NDArray[np.intp]:

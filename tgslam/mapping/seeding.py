@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 from tgslam import runtime
 from tgslam.config.schema import SeedingConfig
 from tgslam.geometry import inverse, quat_wxyz_from_matrices, transform_points
-from tgslam.instance_field import theta_of
 from tgslam.kernels import seeding as kernels
-from tgslam.planes import palette
 from tgslam.types import Camera, Gaussians
 
 _MIN_COSINE = 0.25  # foreshortening is compensated up to here: beyond, a cell's Gaussian would become a needle
@@ -227,7 +225,7 @@ def seed(
     """One flat Gaussian a cell, in the world frame: aligned with the surface, as wide as the cell's footprint.
 
     normals: [H, W, 3] in the camera frame towards the camera, 0 = unknown (then the viewing direction is used).
-    plane_ids: [H, W] PGI of each pixel, -1 = none.
+    plane_ids: [H, W] PGI of each pixel, -1 = none. Embeddings are neutral.
     """
     n = len(cells.u)
     row, column = np.rint(cells.v).astype(int), np.rint(cells.u).astype(int)
@@ -256,7 +254,7 @@ def seed(
         quat_wxyz=quat_wxyz_from_matrices(axes).astype(np.float32),
         opacity_logit=np.full(n, np.log(config.opacity / (1.0 - config.opacity)), np.float32),
         colour=cells.colour.astype(np.float32),
-        embedding=np.zeros((n, 3), np.float32) if plane_ids is None else theta_of(palette.colours(ids)),
+        embedding=np.zeros((n, 3), np.float32),
         plane_id=ids.astype(np.int32),
         birth_keyframe=np.full(n, keyframe, np.int32),
     )

@@ -14,7 +14,7 @@ from tgslam.instance_field import InstanceGradient, InstanceTarget
 from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.sightings import Sightings
 from tgslam.plane_regularisers import PlaneRegularisers
-from tgslam.planes.codes import code_table
+from tgslam.planes.codes import code_table, initial_theta
 from tgslam.planes.table import PlaneTable
 from tgslam.splatting.images import RenderImages
 from tgslam.types import Camera
@@ -37,6 +37,10 @@ class StructureTerms:
         """The planes as they are now; call it when one was added, refitted, merged or removed."""
         self._planes = runtime.to_device(table.planes_w) if len(table) else None
         self.codes = runtime.to_device(code_table(table.ids, self.config))
+
+    def initial_embedding(self, plane_ids: NDArray[np.int32]) -> NDArray[np.float32]:
+        """[N, 3] of new Gaussians on these planes [N], -1 = on none."""
+        return initial_theta(plane_ids, self.config)
 
     def due(self, keyframe: Keyframe) -> InstanceTarget | None:
         """The keyframe's target, if E_pgi takes part in this step: embeddings converge in few, so not in each.

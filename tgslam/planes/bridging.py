@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from tgslam.plane_fit import CellGrid, Floats, Labels
-from tgslam.planes.merging import Agreement, Indices
+from tgslam.plane_fit import CellGrid, Floats, Indices, Labels
+from tgslam.planes.merging import Agreement
 from tgslam.planes.moments import Joints, planes_of
 
 _SIGMAS = 3.0  # beyond which a measurement lies before or behind a plane

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from tgslam import plane_fit
-from tgslam.plane_fit import CellGrid, Floats
+from tgslam.plane_fit import CellGrid, Floats, Indices
 from tgslam.planes.moments import NOISE, Joints, squared_residuals, summed
-
-Indices = NDArray[np.intp]
 
 _FEWEST = 6  # measurements
 _NOISIEST = 5.0  # times as noisy as the sensor should be

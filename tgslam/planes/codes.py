@@ -52,7 +52,7 @@ def read_ids(
 def unmixed(colours: NDArray[np.floating], ids: NDArray[np.integer], config: StructureConfig) -> NDArray[np.int32]:
     """The larger part of the mixture of two ids that comes nearest to each of the colours [N, 3], out of ids [N, K].
 
-    -1 = no plane, which may be a part as well. A mixture has to come as near as codes have to be apart.
+    -1 = no plane, which may be a part as well. A mixture has to come within twice the margin of reading.
     """
     code = codes_of(ids, config)
     first, second = np.triu_indices(ids.shape[1])

@@ -9,11 +9,11 @@ import numpy as np
 
 from tgslam import runtime
 from tgslam.config.schema import PlanesConfig
-from tgslam.plane_fit import CellGrid, Floats, PixelLabels
+from tgslam.plane_fit import CellGrid, Floats, Indices, PixelLabels
 from tgslam.planes.bridging import Pieces, bridge
 from tgslam.planes.cells import CellGraph, planar_cells
 from tgslam.planes.layers import bordering, group_moments, parallel, part_layers, settle
-from tgslam.planes.merging import Agreement, Indices, agglomerate
+from tgslam.planes.merging import Agreement, agglomerate
 from tgslam.planes.moments import NOISE, noise_of, planes_of, squared_residuals
 from tgslam.planes.segment import PlaneSegment, PlaneView
 from tgslam.planes.statistics import Evidence, evidence, totals

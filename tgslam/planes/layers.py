@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from tgslam.plane_fit import Floats, Labels
+from tgslam.plane_fit import Floats, Indices, Labels
 from tgslam.planes.cells import CellGraph
-from tgslam.planes.merging import Agreement, Indices
+from tgslam.planes.merging import Agreement
 from tgslam.planes.moments import NOISE, Joints, information, planes_of, summed, width_px
 
 _WINDOW_CELLS = 3  # over which misfits are averaged
@@ -23,7 +23,6 @@ _TYPICAL = 0.75  # quantile of the misfits of such cells that is the step's
 _DEVIATION = 1.4826  # standard deviations that a median of magnitudes stands for
 _ROUNDS = 3
 _NEIGHBOUR = 6.0  # squared sigmas of misfit that a neighbour of the same surface is worth
-
 _LARGE = 6.0  # likewise, that the surface is large, and needs no plane of its own
 _LARGER = 4.0  # times as many points has a surface that another one is taken to be parallel to
 _MIXED_SHARE = 0.25  # of a small group's nodes, that another plane fits better: fewer are noise

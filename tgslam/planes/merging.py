@@ -7,11 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.plane_fit import Floats
+from tgslam.plane_fit import Floats, Indices
 from tgslam.planes.cells import CellGraph
 from tgslam.planes.moments import NOISE, Joints, summed
-
-Indices = NDArray[np.intp]
 
 _OVER_MEDIAN = 2.0  # three standard deviations: the median of chi-square of 3 degrees is 2.4, its 99 % quantile 11.3
 _ABSORBED = 4.0  # a set of so many times the points hardly changes by what it takes in

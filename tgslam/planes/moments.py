@@ -9,9 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from tgslam.plane_fit import Floats, Indices
 
 NOISE = 10  # column of the summed variance
 
@@ -55,7 +54,7 @@ def scatter(moments: Floats) -> Floats:
     return (np.stack([xx - mean_x * x, across, across, yy - mean_y * y], axis=1) / n[:, None]).reshape(-1, 2, 2)
 
 
-def summed(rows: Floats, group: NDArray[np.intp], groups: int) -> Floats:
+def summed(rows: Floats, group: Indices, groups: int) -> Floats:
     """[groups, K] sums of the rows [N, K] that belong to each group [N], added in their order."""
     return np.stack([np.bincount(group, column, groups) for column in rows.T], axis=1)
 
@@ -69,7 +68,7 @@ class Joints:
     cost: Floats  # [E] 1/m^2, by how much the squared residuals grow if one plane serves both
 
     @classmethod
-    def of(cls, moments: Floats, first: NDArray[np.intp], second: NDArray[np.intp]) -> Joints:
+    def of(cls, moments: Floats, first: Indices, second: Indices) -> Joints:
         """Of the sets `first` and `second` [E] out of those with these moments [N, 11].
 
         The cost is d^T (P_1 + P_2)^-1 d, d the difference of the two planes and P their covariances at unit noise.

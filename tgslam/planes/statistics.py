@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tgslam.plane_fit import CellGrid, Floats, SegmentSums
+from tgslam.plane_fit import CellGrid, Floats, Indices, SegmentSums
 from tgslam.planes.estimate import tangent_axes
 from tgslam.planes.moments import information, scatter, summed, width_px
 from tgslam.planes.segment import PlaneSegment
-
-Indices = NDArray[np.intp]
 
 _CLUSTER_CELLS = 4  # side of the squares of cells within which noise may be correlated
 _FITTED = 3  # parameters

@@ -35,8 +35,10 @@ def _camera(height: int, width: int) -> Camera:
 
 
 def _rendering(height: int, width: int) -> RenderImages:
+    """Of a map that covers the right third of the image in part only."""
     colour, depth_m = _view(height, width, seed=1)
-    opacity = np.random.default_rng(2).uniform(0.45, 1.0, depth_m.shape)
+    least = np.where(np.arange(width) < 2 * width // 3, 0.92, 0.45)
+    opacity = np.random.default_rng(2).uniform(least, 1.0, depth_m.shape)
     arrays = (colour, depth_m * opacity, opacity, np.zeros_like(colour))
     return RenderImages(*(runtime.to_device(array) for array in arrays))
 
