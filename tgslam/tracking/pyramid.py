@@ -75,12 +75,18 @@ class LivePyramid:
 class ModelPyramid:
     """Levels of a rendering of the map, finest first, of the same sizes as those of `LivePyramid`."""
 
-    def __init__(self, camera: Camera, first: int, levels: int, loss: LossConfig, min_opacity: float, rim_opacity: float) -> None:
+    def __init__(
+        self, camera: Camera, first: int, levels: int, loss: LossConfig, min_opacity: float, rim_opacity: float
+    ) -> None:
         """min_opacity: pixels that the map covers no more than that are left out.
 
         rim_opacity: and those round which it covers less than that in the mean are marked as its rim.
         """
-        self.min_opacity, self._rim_opacity, self._images = min_opacity, rim_opacity, _ImagePyramid(camera, first, levels)
+        self.min_opacity, self._rim_opacity, self._images = (
+            min_opacity,
+            rim_opacity,
+            _ImagePyramid(camera, first, levels),
+        )
         self.levels = [_model_level(camera.halved(first + level)) for level in range(levels)]
         sizes = [pair.grey.shape for pair in self._images.pairs]
         self._covers = [runtime.empty(size) for size in (*sizes, images.halved(sizes[-1]))]
