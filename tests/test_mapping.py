@@ -313,7 +313,7 @@ def test_the_final_refinement_sharpens_frames_that_mapping_never_saw(source: Syn
     mapper = mapped(source, range(0, 30, 10), optimizer=optimizer, refine_poses=False)
     before_db, poses = unseen_psnr(mapper, source), [k.T_cw.copy() for k in mapper.keyframes]
     mapper.finish()
-    assert unseen_psnr(mapper, source) > before_db + 1.8
+    assert unseen_psnr(mapper, source) > before_db + 2.0
     assert all((k.T_cw == T_cw).all() for k, T_cw in zip(mapper.keyframes, poses, strict=True))
 
 
