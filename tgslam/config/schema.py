@@ -249,7 +249,7 @@ class ClosureConfig:
     """The pose graph over keyframes, and what planes seen again say to it (sections 3.3, 3.4)."""
 
     enabled: bool = setting(False)  # False: keyframes stay where tracking has put them
-    formulation: str = setting("landmarks", choices=("closures", "landmarks", "both"))  # edges, planes as variables
+    formulation: str = setting("both", choices=("closures", "landmarks", "both"))  # edges, planes as variables
     solver: str = setting("incremental", choices=("incremental", "batch"))  # iSAM2, Levenberg-Marquardt
     # A step's error beyond what tracking's residuals show
     odometry_sigma_rad: float = setting(0.0002, 1e-7, 1.0)
