@@ -276,9 +276,8 @@ def test_new_gaussians_show_the_identity_of_their_plane(source: SyntheticSource,
     ids = mapper.gaussians.host("plane_id")
     assert len(np.unique(ids)) > 3
     shown = 1.0 / (1.0 + np.exp(-mapper.gaussians.host("embedding")))
-    assert (
-        np.isclose(shown, codes_of(ids, structure), atol=0.021).all(axis=1).mean() > 0.97
-    )  # `label` has another look at rims
+    right = np.isclose(shown, codes_of(ids, structure), atol=0.021).all(axis=1)
+    assert right.mean() > 0.97  # `label` has another look at rims
 
 
 # Refinement

@@ -82,11 +82,8 @@ class ModelPyramid:
 
         rim_opacity: and those round which it covers less than that in the mean are marked as its rim.
         """
-        self.min_opacity, self._rim_opacity, self._images = (
-            min_opacity,
-            rim_opacity,
-            _ImagePyramid(camera, first, levels),
-        )
+        self.min_opacity, self._rim_opacity = min_opacity, rim_opacity
+        self._images = _ImagePyramid(camera, first, levels)
         self.levels = [_model_level(camera.halved(first + level)) for level in range(levels)]
         sizes = [pair.grey.shape for pair in self._images.pairs]
         self._covers = [runtime.empty(size) for size in (*sizes, images.halved(sizes[-1]))]
