@@ -7,7 +7,7 @@ kernels go over blocks of Gaussians, a block a thread on the CPU and a warp unde
 import taichi as ti
 
 from tgslam.kernels.cuda.warp import WARP, warp_sum
-from tgslam.kernels.objective import charbonnier_root, share
+from tgslam.kernels.objective import share
 from tgslam.kernels.projection import rotation_from_quat
 from tgslam.kernels.simd import exp_neg
 
@@ -43,7 +43,6 @@ def regularise_one(
     weights,
     thinness,
     per_sigma,
-    epsilon,
     grad_mean: ti.template(),
     grad_log_scale: ti.template(),
     grad_quat: ti.template(),
@@ -74,13 +73,13 @@ def regularise_one(
     grad_quat[i, 0] = grad_quat[i, 0] - turn.dot(of_q)
     for c in ti.static(range(3)):
         grad_quat[i, 1 + c] = grad_quat[i, 1 + c] + by_vector[c]
-    # Distance
+    # Distance: what is far off lies on another surface, next to the plane, and is left there
     height = per_sigma * (normal.dot(ti.Vector([mean[i, 0], mean[i, 1], mean[i, 2]])) + plane[at, 3])
-    root = charbonnier_root(height * height, epsilon)
-    by_height = weights[2] * per_sigma * height / root
+    bound = 1.0 + height * height
+    by_height = weights[2] * per_sigma * height / (bound * bound)
     for c in ti.static(range(3)):
         grad_mean[i, c] = grad_mean[i, c] + by_height * normal[c]
-    return vec4(0.0, off * off, 1.0 - ti.abs(cosine), root - epsilon)
+    return vec4(0.0, off * off, 1.0 - ti.abs(cosine), 0.5 * height * height / bound)
 
 
 @ti.kernel
@@ -123,7 +122,6 @@ def regularise(
     weight_distance: ti.f32,
     thinness: ti.f32,  # k of Eq. 8
     sigma_m: ti.f32,  # unit of the distance
-    epsilon: ti.f32,  # Charbonnier, in sigmas
     counted: F1,  # [TOTALS] of which COUNT is read
     grad_mean: F2,  # [N, 3] added to, as are the next two
     grad_log_scale: F2,  # [N, 3]
@@ -142,7 +140,7 @@ def regularise(
                 each = share(1.0, counted[COUNT])
                 part = regularise_one(
                     i, plane_id, plane, mean, log_scale, quat,
-                    each * ti.Vector([weight_flat, weight_normal, weight_distance]), thinness, 1.0 / sigma_m, epsilon,
+                    each * ti.Vector([weight_flat, weight_normal, weight_distance]), thinness, 1.0 / sigma_m,
                     grad_mean, grad_log_scale, grad_quat,
                 )  # fmt: skip
                 part[COUNT] = 1.0
@@ -159,7 +157,7 @@ def regularise(
                     total += regularise_one(
                         i, plane_id, plane, mean, log_scale, quat,
                         each * ti.Vector([weight_flat, weight_normal, weight_distance]), thinness, 1.0 / sigma_m,
-                        epsilon, grad_mean, grad_log_scale, grad_quat,
+                        grad_mean, grad_log_scale, grad_quat,
                     )  # fmt: skip
                     total[COUNT] += 1.0
             for c in ti.static(range(TOTALS)):

@@ -33,7 +33,7 @@ class PlaneRegularisers:
 
         - flat, Eq. 8 in units of s1 s2: (s3 / sqrt(s1 s2) - thinness)^2, where the unit counts as a constant;
         - normal, Eq. 9: 1 - |a . n|;
-        - distance: Charbonnier on (n . mean + d) / sigma_distance_m.
+        - distance: Geman-McClure, h^2 / 2 / (1 + h^2), on h = (n . mean + d) / sigma_distance_m.
         """
         config = self.config
         require("planes", planes, (None, 4))
@@ -47,7 +47,7 @@ class PlaneRegularisers:
             gaussians.mean, gaussians.log_scale, gaussians.quat_wxyz,
             config.lambda_str * config.omega_flat, config.lambda_str * config.omega_normal,
             config.lambda_str * config.omega_distance,
-            config.thinness, config.sigma_distance_m, config.charbonnier_distance_sigmas, self._counted,
+            config.thinness, config.sigma_distance_m, self._counted,
             into.mean, into.log_scale, into.quat_wxyz, self._partial,
         )  # fmt: skip
 

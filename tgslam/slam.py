@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tgslam import runtime
 from tgslam.config.schema import Config
-from tgslam.depth import measured_share, without_flying_pixels
+from tgslam.depth import measured_share, without_flying_pixels, without_range_limit
 from tgslam.errors import ConfigError, FrameError, GraphError
 from tgslam.geometry import inverse, orthonormalized
 from tgslam.keyframes import KeyframeSelector
@@ -194,7 +194,8 @@ class Slam:
         size = (self.camera.height, self.camera.width)
         if frame.depth_m.shape != size or frame.colour.shape != (*size, 3):
             raise FrameError(f"frame {frame.index}: images of {frame.depth_m.shape} do not fit the camera's {size}")
-        depth_m = without_flying_pixels(runtime.to_device(frame.depth_m), self.sigma_per_m2, self.camera.fx)
+        in_range = without_range_limit(frame.depth_m, self.sigma_per_m2)
+        depth_m = without_flying_pixels(runtime.to_device(in_range), self.sigma_per_m2, self.camera.fx)
         if measured_share(depth_m) < _MIN_DEPTH_SHARE:
             raise FrameError(f"frame {frame.index}: depth in less than {_MIN_DEPTH_SHARE:.0%} of its pixels")
         return replace(frame, colour=runtime.to_device(frame.colour), depth_m=depth_m)

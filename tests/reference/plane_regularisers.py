@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from tests.reference.loss import charbonnier
 from tgslam.geometry import matrix_from_quat_wxyz
 
 
@@ -18,6 +17,11 @@ def planar(visible, plane_id, planes):
     ])  # fmt: skip
 
 
+def geman_mcclure(x):
+    """x^2 / 2 for small x; 1/2 at most."""
+    return 0.5 * x**2 / (1.0 + x**2)
+
+
 def parts(mean, log_scale, quat, areas, use, plane_id, planes, config):
     """Means of the three penalties over the Gaussians in `use`."""
     sums = np.zeros(3)
@@ -28,7 +32,7 @@ def parts(mean, log_scale, quat, areas, use, plane_id, planes, config):
         sums += (
             (s3 - config.thinness * np.sqrt(s1 * s2)) ** 2 / areas[i],
             1 - abs(axis @ normal),
-            charbonnier((normal @ mean[i] + offset) / config.sigma_distance_m, config.charbonnier_distance_sigmas),
+            geman_mcclure((normal @ mean[i] + offset) / config.sigma_distance_m),
         )
     return dict(zip(("flat", "normal", "distance"), sums / max(use.sum(), 1), strict=True))
 
