@@ -27,7 +27,7 @@ class Carriers:
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Remove the rows where the mask [N] is false."""
-        self.keyframes = self.keyframes[mask]
+        self.keyframes = self.keyframes.take(np.flatnonzero(mask), axis=0)
 
     def learn(self, rows: NDArray[np.intp], keyframe: int, gain: NDArray[np.float64]) -> None:
         """A keyframe has moved the places of these rows [n] by `gain` [n] of the way to where it sees them.
@@ -35,5 +35,6 @@ class Carriers:
         The draw is the same for all rows, so that neighbours with one history keep on moving alike, and stratified: of
         eight slots, a gain of 0.3 takes two or three.
         """
-        threshold = (self._rng.permutation(_SLOTS) + self._rng.random()) / _SLOTS
-        self.keyframes[rows] = np.where(threshold < gain[:, None], np.int32(keyframe), self.keyframes[rows])
+        thresholds = (self._rng.permutation(_SLOTS) + self._rng.random()) / _SLOTS
+        for slot, threshold in enumerate(thresholds):
+            self.keyframes[rows[threshold < gain], slot] = keyframe
