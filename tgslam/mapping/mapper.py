@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _MIN_COSINE = 0.1  # a surface more grazing than this says nothing of the depth beside
 _MAX_SLANT = 0.1  # nor one whose depth changes by more within a block
 _NOTICED_M = 0.005  # by which keyframes have moved against each other, for the map between them to be refined
-_FIRST_PACE, _LAST_PACE = 0.7, 0.3  # steps after a motion, from so much of their usual size to so much
+_LAST_PACE = 0.3  # after a motion, steps get smaller down to this share
 _GUESS_SHARE = 0.8  # of a later guess of depth: an earlier one that is less is wrong
 _STEEPEST = 0.1  # deepest a Gaussian may be at the rim of the image, standard deviation over depth
 _OWNERS = 6  # keyframes at most
@@ -106,16 +106,15 @@ class Mapper:
         self._prune()
 
     def _settle(self) -> None:
-        """Refine the window after a motion, with small steps that get smaller.
+        """Refine the window after a motion, with smaller and smaller steps.
 
         Where keyframes have moved against each other, what they share cannot fit all of them. Full steps would leave it
-        where the views of the window, which outnumber the anchors, have pushed it, and would fit what the anchors'
-        neighbours see to the anchors alone. The anchors come first, since momentum carries on with the steps that are
-        taken while the tear is new.
+        where the views of the window, which outnumber the anchors, have pushed it. The anchors come first, since
+        momentum carries on with the steps that are taken while the tear is new.
         """
         window = self._window()
         views = _in_turn([*self._anchors(window), *window], self.config.iterations)
-        for view, pace in zip(views, np.linspace(_FIRST_PACE, _LAST_PACE, len(views)), strict=True):
+        for view, pace in zip(views, np.linspace(1.0, _LAST_PACE, len(views)), strict=True):
             self._refine(view, float(pace))
         self._prune()
 
