@@ -45,6 +45,17 @@ def test_first_step_has_the_length_of_the_rate_whatever_the_gradient():
     np.testing.assert_allclose(runtime.to_host(x), [[-0.1, 0.1], [-0.1, 0.1], [0.0, -0.1]], rtol=1e-5)
 
 
+def test_pace_scales_the_step_and_leaves_the_moments():
+    full, half = (Adam({"x": 2}, {"x": 0.1}, 3) for _ in range(2))
+    x, y = runtime.zeros((3, 2)), runtime.zeros((3, 2))
+    gradient = runtime.to_device([[1.0, -2.0], [3.0, 4.0], [0.0, 0.5]])
+    full.step({"x": x}, {"x": gradient})
+    half.step({"x": y}, {"x": gradient}, pace=0.5)
+    np.testing.assert_allclose(runtime.to_host(y), 0.5 * runtime.to_host(x), rtol=1e-6)
+    for one, other in zip(full.moments("x"), half.moments("x"), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_invisible_rows_are_bitwise_untouched(rng):
     adam = Adam({"x": 4}, {"x": 0.1}, 50)
     x = runtime.to_device(rng.normal(size=(50, 4)))

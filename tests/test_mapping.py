@@ -65,6 +65,7 @@ def assert_rows_agree(mapper: Mapper) -> None:
     """Everything that is kept by the Gaussian has as many rows as the map."""
     refiner = mapper.refiner
     rows = {**rows_of(mapper), "contribution": refiner.contribution, "views": refiner.views}
+    rows["carriers"] = mapper.carriers.keyframes
     assert {"support", "conflict"} <= set(rows)
     assert refiner.adam.rows == mapper.gaussians.count
     assert {name: len(array) for name, array in rows.items()} == dict.fromkeys(rows, mapper.gaussians.count)
@@ -229,6 +230,7 @@ def plant(mapper: Mapper, gaussians: Gaussians) -> None:
     """Add Gaussians by hand, with their rows everywhere."""
     mapper.gaussians.append(gaussians)
     mapper.refiner.append(len(gaussians))
+    mapper.carriers.append(gaussians.birth_keyframe)
     for name, array in rows_of(mapper).items():
         setattr(mapper, name, np.append(array, np.zeros(len(gaussians), array.dtype)))
 
@@ -452,12 +454,13 @@ def own_depth_off_m(mapper: Mapper, keyframe: Keyframe) -> float:
     return float(np.median(np.abs(shown - measured)[both]))
 
 
-def test_the_map_follows_its_keyframes(source: SyntheticSource) -> None:
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_map_follows_its_keyframes(seed: int) -> None:
     """Issue: depth of old keyframes changes by less than 2 mm (median), PSNR comes back to within 0.3 dB.
 
-    The PSNR is the mean over the old keyframes. By the sensor's seed the first one, which refinement of the window
-    hardly sees, loses up to 0.5 dB.
+    Of each old keyframe; also of the first one, which refinement of the window hardly sees.
     """
+    source = SyntheticSource(SyntheticConfig(scene="room", width=160, height=120, frames=720), seed=seed)
     mapper = make_mapper(source, window=3, iterations=9)
     for index in range(0, 40, 8):
         mapper.add_keyframe(keyframe(source, source.read(index)))
@@ -471,13 +474,52 @@ def test_the_map_follows_its_keyframes(source: SyntheticSource) -> None:
     for k, (was, now) in enumerate(zip(before, after, strict=True)):
         both = (was.depth_m > 0) & (now.depth_m > 0)
         assert np.median(np.abs(was.depth_m - now.depth_m)[both]) < 0.002
-        assert own_depth_off_m(mapper, old[k]) < off_m[k] + 0.002
-    change_db = [psnr(now.colour, k.colour()) - was for now, k, was in zip(after, old, quality, strict=True)]
-    assert np.mean(change_db) > -0.3 and min(change_db) > -0.6
+        assert own_depth_off_m(mapper, old[k]) < off_m[k] + 0.001
+        assert psnr(now.colour, old[k].colour()) > quality[k] - 0.2
     np.testing.assert_allclose(old[0].T_cw, poses[0], atol=1e-9)
     moved = inverse(mapper.keyframes[-1].T_cw) @ poses[-1]
     np.testing.assert_allclose(moved, corrections(5)[4], atol=0.005)  # refinement moves the window a little
     assert_rows_agree(mapper)
+
+
+def test_gaussians_move_by_what_each_keyframe_has_said_of_their_depth(source: SyntheticSource) -> None:
+    """What the second keyframe has not measured stays with the first one, the rest moves by its share of what is known,
+    in eighths."""
+    mapper, frame = make_mapper(source, iterations=0), source.read(0)
+    mapper.add_keyframe(keyframe(source, frame))
+    alone, count = mapper.information.copy(), mapper.gaussians.count
+    numbered = np.zeros((count, 3), np.float32)
+    numbered[:, 0] = np.arange(count)
+    mapper.gaussians.write("embedding", slice(0, count), numbered)  # some will go
+    hidden = replace(frame, index=1, depth_m=frame.depth_m.copy())
+    hidden.depth_m[PATCH] = 0.0
+    mapper.add_keyframe(keyframe(source, hidden, np.eye(4)))
+    rows = np.flatnonzero((mapper.gaussians.host("birth_keyframe") == 0) & (mapper.information > 0))
+    share = 1.0 - alone[mapper.gaussians.host("embedding")[rows, 0].astype(int)] / mapper.information[rows]
+    before = mapper.gaussians.host("mean")[rows]
+    mapper.follow({1: se3_exp([0.0, 0.0, 0.0, 0.008, 0.0, 0.0])})
+    moved_m = mapper.gaussians.host("mean")[rows] - before
+    unseen = in_patch(source, before, PATCH)
+    assert unseen.sum() > 50
+    np.testing.assert_allclose(moved_m[unseen], 0.0, atol=1e-6)
+    assert np.median(share) > 0.2 and len(rows) > 4000
+    np.testing.assert_allclose(moved_m[:, 0], 0.008 * share, atol=0.001 + 1e-6)
+    np.testing.assert_allclose(moved_m[:, 1:], 0.0, atol=1e-6)
+
+
+def test_a_loop_that_closes_tears_no_view() -> None:
+    """Drift of 3 cm and 6 mrad is spread over a walk. Depth stays with each keyframe's own, and so do the colours,
+    nearly, before anything is refined."""
+    walk = SyntheticSource(SyntheticConfig(scene="loop", width=160, height=120, frames=720), seed=0)
+    mapper = mapped(walk, range(0, 240, 12), iterations=6)
+    mapper.config = replace(mapper.config, iterations=0)
+    off_m = [own_depth_off_m(mapper, k) for k in mapper.keyframes]
+    quality = [psnr(view(mapper, k.T_cw).colour, k.colour()) for k in mapper.keyframes]
+    drift = np.array([0.07, -0.09, 0.04, 0.75, -0.5, 0.45]) * 0.03
+    mapper.follow({k: se3_exp(drift * k / 19) for k in range(20)})
+    for keyframe_, off, was in zip(mapper.keyframes, off_m, quality, strict=True):
+        assert own_depth_off_m(mapper, keyframe_) < off + 0.001
+        assert psnr(view(mapper, keyframe_.T_cw).colour, keyframe_.colour()) > was - 0.6
 
 
 def test_a_common_motion_of_all_keyframes_changes_no_view_and_refines_nothing(source: SyntheticSource) -> None:

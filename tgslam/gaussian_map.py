@@ -72,10 +72,14 @@ class GaussianMap:
             self.write(name, slice(0, kept), rows)
         self.count = kept
 
-    def move(self, motions: NDArray[np.float64]) -> None:
-        """Move each row with its birth keyframe: p_w <- motions[birth] p_w, rigid [K, 4, 4] for all K keyframes."""
+    def move(self, motions: NDArray[np.float64], carriers: NDArray[np.int32]) -> None:
+        """Move each row by the mean of some motions: p_w <- mean of motions[carriers] p_w.
+
+        motions: rigid, [K, 4, 4]. carriers: [count, S] which of them.
+        """
         rigid.move_rows(
-            self.count, self.birth_keyframe, runtime.to_device(quat_wxyz_from_matrices(motions[:, :3, :3])),
+            self.count, runtime.to_device(carriers, np.int32),
+            runtime.to_device(quat_wxyz_from_matrices(motions[:, :3, :3])),
             runtime.to_device(motions[:, :3].reshape(-1, 12)), self.mean, self.quat_wxyz,
         )  # fmt: skip
 

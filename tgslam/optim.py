@@ -66,12 +66,17 @@ class Adam:
         return runtime.to_host(self._steps)[: self._rows]
 
     def step(
-        self, parameters: dict[str, np.ndarray], gradients: dict[str, np.ndarray], visible: np.ndarray | None = None
+        self,
+        parameters: dict[str, np.ndarray],
+        gradients: dict[str, np.ndarray],
+        visible: np.ndarray | None = None,
+        pace: float = 1.0,
     ) -> None:
         """Update float32 [N] or [N, C] parameters in place from gradients of that shape; N may exceed `rows`.
 
-        visible: int32 [N], 0 = leave the row and its moments alone; by default every row is updated. Groups that are
-        not in `parameters` rest. Raises ValueError for unknown groups, other shapes or dtypes.
+        visible: int32 [N], 0 = leave the row and its moments alone; by default every row is updated. pace:
+        what all learning rates are multiplied by. Groups that are not in `parameters` rest. Raises ValueError for
+        unknown groups, other shapes or dtypes.
         """
         for group in parameters:
             if group not in self._channels:
@@ -87,7 +92,7 @@ class Adam:
         arrays = [array for group in parameters for array in (gradients[group], parameters[group])]
         unused = kernels.GROUPS - len(parameters)
         kernels.adam_rows(
-            self._rows, [self.learning_rates[group] for group in parameters] + [0.0] * unused,
+            self._rows, [pace * self.learning_rates[group] for group in parameters] + [0.0] * unused,
             *self._gains, self._epsilon, self._correction, visible, self._steps, self._moments,
             *arrays, *arrays[:2] * unused, tuple((self._first_column[g], self._channels[g]) for g in parameters),
         )  # fmt: skip

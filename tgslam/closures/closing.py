@@ -70,7 +70,7 @@ class GraphClosing:
         return Correction(self._motions(T_cw), tuple(closure.earlier for closure in found))
 
     def _add_odometry(self, keyframes: Sequence[Keyframe]) -> None:
-        """Tracking measures a pose against the map, that is, against the keyframes that its Gaussians move with.
+        """Tracking measures a pose against the map, that is, against the keyframes that its Gaussians were seeded from.
 
         Were it counted as a motion from the previous keyframe alone, what planes turn that one by would seem undone in
         each step that still sees the older map, and the graph would drift away from both.

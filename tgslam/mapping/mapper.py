@@ -15,6 +15,7 @@ from tgslam.config.schema import LossConfig, MappingConfig, PlanesConfig, Seedin
 from tgslam.depth import filled, range_of
 from tgslam.gaussian_map import GaussianMap
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, orthonormalized, transform_points
+from tgslam.mapping.carriers import Carriers
 from tgslam.mapping.coarse import halved, seen_in_part, seen_whole
 from tgslam.mapping.fusion import block_centre, depth_pyramid, fused_depth, sample, turned
 from tgslam.mapping.keyframe import Keyframe
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 _MIN_COSINE = 0.1  # a surface more grazing than this says nothing of the depth beside
 _MAX_SLANT = 0.1  # nor one whose depth changes by more within a block
 _NOTICED_M = 0.005  # by which keyframes have moved against each other, for the map between them to be refined
+_LAST_PACE = 0.3  # after a motion, steps get smaller down to this share
 _GUESS_SHARE = 0.8  # of a later guess of depth: an earlier one that is less is wrong
 _STEEPEST = 0.1  # deepest a Gaussian may be at the rim of the image, standard deviation over depth
 _OWNERS = 6  # keyframes at most
@@ -57,6 +59,7 @@ class Mapper:
         self.viewpoints = Viewpoints(rng)
         self.refiner = Refiner(camera, mapping, loss, structure=structure if self.planes else None)
         self.range_m = 0.0  # as far as the sensor has measured
+        self.carriers = Carriers(rng.spawn(1)[0])
         self.guessed = np.zeros(0, bool)  # [N] seeded where no depth was measured
         self.information = np.zeros(0)  # [N] 1/m^2, what is known of a Gaussian's depth
         self.support = np.zeros(0, np.int32)  # [N] keyframes whose depth agrees with the Gaussian
@@ -91,17 +94,35 @@ class Mapper:
         for number, motion in motions.items():
             every[number] = motion
             self.keyframes[number].T_cw = orthonormalized(self.keyframes[number].T_cw @ inverse(motion))
-        self.gaussians.move(every)
+        self.gaussians.move(every, self.carriers.keyframes)
         if self.planes:
             self.planes.follow(self.keyframes)
             self.refiner.set_planes(self.planes.table())
         if _bend_m(every, self.keyframes) > _NOTICED_M:
-            self._refine_window()
+            self._settle()
 
     def _refine_window(self) -> None:
-        for view in self._schedule(self.config.iterations):
-            self.refiner.step(self.gaussians, view, move_pose=self._may_move(view))
+        window = self._window()
+        for view in _in_turn([*window, *self._anchors(window)], self.config.iterations):
+            self._refine(view)
         self._prune()
+
+    def _settle(self) -> None:
+        """Refine the window after a motion, with smaller and smaller steps.
+
+        Where keyframes have moved against each other, what they share cannot fit all of them. Full steps would leave it
+        where the views of the window, which outnumber the anchors, have pushed it. The anchors come first, since
+        momentum carries on with the steps that are taken while the tear is new.
+        """
+        window = self._window()
+        views = _in_turn([*self._anchors(window), *window], self.config.iterations)
+        for view, pace in zip(views, np.linspace(1.0, _LAST_PACE, len(views)), strict=True):
+            self._refine(view, float(pace))
+        self._prune()
+
+    def _refine(self, number: int, pace: float = 1.0) -> None:
+        view = self.keyframes[number]
+        self.refiner.step(self.gaussians, view, move_pose=self._may_move(view), pace=pace)
 
     def finish(self) -> None:
         """The final pass: every keyframe in turn, in random order, poses fixed."""
@@ -154,19 +175,21 @@ class Mapper:
             new = replace(new, embedding=self.refiner.structure.initial_embedding(new.plane_id))
         guessed = measured_m[np.rint(cells.v).astype(int), np.rint(cells.u).astype(int)] <= 0
         information = np.where(guessed, 0.0, cells.size_px**2 / self._sigma_m(cells.depth_m) ** 2)
-        self._append(new, guessed, information)
+        self._append(new, guessed, information, new.birth_keyframe)
 
     def _append(
         self,
         new: Gaussians,
         guessed: NDArray[np.bool_],
         information: NDArray[np.float64],
+        carriers: NDArray[np.int32],
         support: NDArray[np.int32] | None = None,
         conflict: NDArray[np.int32] | None = None,
     ) -> None:
         none = np.zeros(len(new), np.int32)
         self.gaussians.append(new)
         self.refiner.append(len(new))
+        self.carriers.append(carriers)
         self.guessed = np.concatenate([self.guessed, guessed])
         self.information = np.concatenate([self.information, information])
         self.support = np.concatenate([self.support, none if support is None else support])
@@ -192,6 +215,7 @@ class Mapper:
         agrees = (measured > 0) & (np.abs(measured - z) < self.config.insert_sigmas * self._sigma_m(z))
         evidence = np.where(agrees, block_px**2 / self._sigma_m(z) ** 2, 0.0)
         fused, self.information[rows], gain = fused_depth(z, self.information[rows], measured, evidence)
+        self.carriers.learn(rows, len(self.keyframes) - 1, gain)
         T_wc = inverse(keyframe.T_cw)
         normals = images.normals(runtime.to_device(depth_m), self.camera, sigma_per_m2=self.loss.depth_sigma_per_m2)
         towards = runtime.to_host(normals)[v, u].astype(np.float64) @ T_wc[:3, :3].T
@@ -236,7 +260,8 @@ class Mapper:
         part = seen_in_part(self.gaussians, surface, _STEEPEST)
         parts, of = halved(self.gaussians, np.flatnonzero(part), surface, _STEEPEST, 1.0 / self.seeding.overlap)
         share = 1.0 / np.bincount(of, minlength=len(part))[of]
-        self._append(parts, self.guessed[of], share * self.information[of], self.support[of], self.conflict[of])
+        information, carriers = share * self.information[of], self.carriers.keyframes[of]
+        self._append(parts, self.guessed[of], information, carriers, self.support[of], self.conflict[of])
         return ~(whole | part)
 
     def _limit_px(self, keyframe: Keyframe, planes: PlanarPixels | None) -> NDArray[np.float64]:
@@ -272,14 +297,13 @@ class Mapper:
             return
         self.gaussians.keep(keep)
         self.refiner.keep(keep)
+        self.carriers.keep(keep)
         self.guessed, self.information = self.guessed[keep], self.information[keep]
         self.support, self.conflict = self.support[keep], self.conflict[keep]
 
-    def _schedule(self, iterations: int) -> list[Keyframe]:
-        """The views to refine: the latest keyframes in turn, newest first, with some earlier ones (SGVs)."""
-        numbers = range(len(self.keyframes))[-self.config.window :][::-1]
-        window = [self.keyframes[k] for k in [*numbers, *self._anchors(numbers)]]
-        return [window[i % len(window)] for i in range(iterations)]
+    def _window(self) -> list[int]:
+        """The latest keyframes, newest first."""
+        return list(range(len(self.keyframes))[-self.config.window :][::-1])
 
     def _anchors(self, window: Sequence[int]) -> list[int]:
         """Earlier keyframes to refine with a window, so that it does not leave them behind."""
@@ -296,6 +320,11 @@ class Mapper:
         """The first keyframe holds the world frame; earlier ones outside the window are anchors."""
         window = self.keyframes[-self.config.window :]
         return self.config.refine_poses and keyframe is not self.keyframes[0] and any(keyframe is k for k in window)
+
+
+def _in_turn(numbers: Sequence[int], count: int) -> list[int]:
+    """So many of these numbers, over and over in their order."""
+    return [numbers[i % len(numbers)] for i in range(count)]
 
 
 def _bend_m(motions: NDArray[np.float64], keyframes: Sequence[Keyframe]) -> float:

@@ -76,8 +76,12 @@ class Refiner:
         if self.structure:
             self.structure.set_planes(planes)
 
-    def step(self, gaussians: GaussianMap, keyframe: Keyframe, *, move_pose: bool) -> losses.LossResult:
+    def step(
+        self, gaussians: GaussianMap, keyframe: Keyframe, *, move_pose: bool, pace: float = 1.0
+    ) -> losses.LossResult:
         """Render the map at the keyframe, and move the map (and the keyframe's pose) downhill.
+
+        pace: what the map's steps are multiplied by, but for those of embeddings.
 
         Returns the loss before the step; its numbers can be read until the next step. Only the pose's gradient goes to
         the host by itself.
@@ -96,7 +100,7 @@ class Refiner:
         with stage(self.stopwatch, "backward"):
             g_pose = self._backward(gaussians, loss, pgi)
         with stage(self.stopwatch, "update"):
-            self._update_map(gaussians, loss, pgi)
+            self._update_map(gaussians, loss, pgi, pace)
             if move_pose:
                 self._update_pose(keyframe, g_pose)
         return loss
@@ -118,7 +122,9 @@ class Refiner:
         )  # fmt: skip
         return self.rasterizer.backward(gaussians, g, self._gradient)
 
-    def _update_map(self, gaussians: GaussianMap, loss: losses.LossResult, pgi: InstanceGradient | None) -> None:
+    def _update_map(
+        self, gaussians: GaussianMap, loss: losses.LossResult, pgi: InstanceGradient | None, pace: float
+    ) -> None:
         gradient, visible = self._gradient, self.rasterizer.tile_count
         if self.structure:
             self.structure.regularise(gaussians, visible, gradient)
@@ -129,12 +135,13 @@ class Refiner:
             {name: getattr(gaussians, name) for name in names},
             {name: getattr(gradient, name) for name in names},
             visible,
+            pace,
         )
         weight = self.loss.weight_pho * self.loss.weight_l1 / (3.0 * self.loss.charbonnier_colour)
         if self.config.optimizer == "relaxation":
             relaxation.relax(
-                gaussians.count, visible, gradient.colour, gradient.curvature, loss.totals, self.config.relaxation,
-                weight, gaussians.colour,
+                gaussians.count, visible, gradient.colour, gradient.curvature, loss.totals,
+                pace * self.config.relaxation, weight, gaussians.colour,
             )  # fmt: skip
         self._sightings.record(visible, gradient.curvature, loss.totals, weight)
 

@@ -12,7 +12,7 @@ from tgslam.types import Gaussians
 
 @scenario
 def rows(count: int = 300, keyframes: int = 5) -> dict[str, np.ndarray]:
-    """Random rows after random motions."""
+    """Random rows after means of random motions."""
     rng = np.random.default_rng(0)
     moved = GaussianMap.from_gaussians(
         Gaussians(
@@ -23,8 +23,9 @@ def rows(count: int = 300, keyframes: int = 5) -> dict[str, np.ndarray]:
             colour=np.zeros((count, 3), np.float32),
             embedding=np.zeros((count, 3), np.float32),
             plane_id=np.full(count, -1, np.int32),
-            birth_keyframe=rng.integers(0, keyframes, count).astype(np.int32),
+            birth_keyframe=np.zeros(count, np.int32),
         )
     )
-    moved.move(np.stack([se3_exp(rng.normal(size=6)) for _ in range(keyframes)]))
+    carriers = rng.integers(0, keyframes, (count, 3)).astype(np.int32)
+    moved.move(np.stack([se3_exp(rng.normal(size=6)) for _ in range(keyframes)]), carriers)
     return {"mean": moved.host("mean").copy(), "quat_wxyz": moved.host("quat_wxyz").copy()}
