@@ -187,3 +187,30 @@ def spread_normals(
                 out[r, c, 2] = keep * nz
                 if ti.static(with_depth):
                     out[r, c, MODEL_DEPTH] = ti.select(z > 0.0 and z < FAR_M, z, 0.0)
+
+
+@ti.kernel
+def adopt_normals(
+    settings: nd(ti.f32, ndim=1),  # [SETTINGS]
+    planes: nd(ti.f32, ndim=2),  # [P, 4] unit normal towards the camera and offset in m of n . x + d = 0, camera frame
+    least_cosine: ti.f32,  # between a pixel's normal and that of its plane
+    slack_m: ti.f32,  # a pixel's surface is off its plane by no more than this
+    sigmas: ti.f32,  # and so many standard deviations of the sensor's depth
+    surface: nd(ti.f32, ndim=3),  # [H, W, 4] normal, 0 = none, and depth in m, along which the distance is measured
+):
+    """Give each pixel the normal of the nearest plane that its surface lies on."""
+    for s in range(surface.shape[0] * SPLIT):
+        i, begin, end = segment(s, surface.shape[1])
+        y = (i - settings[CY]) / settings[FY]
+        for j in range(begin, end):
+            x, z = (j - settings[CX]) / settings[FX], surface[i, j, MODEL_DEPTH]
+            nx, ny, nz = surface[i, j, 0], surface[i, j, 1], surface[i, j, 2]
+            nearest, on = slack_m + sigmas * settings[SIGMA] * z * z, -1
+            for k in range(planes.shape[0]):
+                px, py, pz = planes[k, 0], planes[k, 1], planes[k, 2]
+                off = ti.abs(z * (px * x + py * y + pz) + planes[k, 3])
+                if off < nearest and nx * px + ny * py + nz * pz > least_cosine:
+                    nearest, on = off, k
+            if on >= 0:
+                for c in ti.static(range(3)):
+                    surface[i, j, c] = planes[on, c]

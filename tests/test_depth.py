@@ -160,40 +160,6 @@ def test_nothing_to_fill_or_to_fill_from():
     np.testing.assert_array_equal(depth.filled(empty), empty)
 
 
-def corridor_depth(range_m):
-    """A floor that runs off into the distance, in a camera of 60 px focal length; beyond range_m there is no depth."""
-    below = (np.arange(48) - 20.0)[:, None] * np.ones((1, 64))
-    exact_m = np.where(below > 0, 60.0 * 1.4 / np.maximum(below, 1e-3), 50.0).astype(np.float32)
-    return exact_m, np.where(exact_m < range_m, exact_m, np.float32(0.0))
-
-
-def test_beyond_the_range_guesses_stand_behind_all_that_was_measured():
-    _, depth_m = corridor_depth(7.0)
-    range_m = depth.range_of(depth_m)
-    assert 6.0 < range_m < 7.0
-    guess = depth.filled(depth_m, range_m)
-    assert guess[depth_m == 0].min() > 1.1 * range_m
-    np.testing.assert_array_equal(guess[depth_m > 0], depth_m[depth_m > 0])
-
-
-def test_holes_among_near_surfaces_and_narrow_ones_are_filled_as_ever():
-    _, depth_m = corridor_depth(7.0)
-    range_m = depth.range_of(depth_m)
-    depth_m[40:46, 10:30] = 0.0  # at 3.5 m
-    depth_m[:, 50] = 0.0
-    usual, guess = depth.filled(depth_m), depth.filled(depth_m, range_m)
-    near = np.zeros(depth_m.shape, bool)
-    near[40:46, 10:30] = near[36:, 50] = True
-    np.testing.assert_array_equal(guess[near], usual[near])
-
-
-def test_range_is_that_of_all_but_a_thousandth():
-    depth_m = np.full((100, 100), 3.0, np.float32)
-    depth_m[0, :5] = 30.0
-    assert depth.range_of(depth_m) == pytest.approx(3.0)
-    assert depth.range_of(np.zeros((4, 4), np.float32)) == 0.0
-
-
 @pytest.mark.parametrize("beyond_sigmas", [-1.0, -0.5, 0.0, 1.0])
 def test_a_wall_that_noise_brings_into_range_is_dropped(beyond_sigmas):
     sigma_per_m2, range_m = 0.0015, 7.0

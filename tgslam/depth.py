@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +18,6 @@ _RANGE_SIGMAS = 3.0  # nearer to the farthest measurement than this, noise decid
 _RANGE_WINDOW_PX = 9
 _RANGE_SHARE = 0.9  # of the window that has depth; then a surface reads at most 0.2 sigma too near
 _NARROW_PX = 2  # a hole's pixels that are no farther from a measurement are at an edge
-_BEYOND_SHARE = 0.85  # of the sensor's range: a wide hole among what is farther off opens beyond it
-_BEYOND = 1.2  # times the range: where such a hole is taken to end
 
 
 def without_flying_pixels(depth_m: np.ndarray, sigma_per_m2: float, focal_px: float) -> np.ndarray:
@@ -70,36 +66,22 @@ def nearest_measured(depth_m: NDArray[np.float32]) -> NDArray[np.int64]:
     return pixels[regions]
 
 
-def range_of(depth_m: NDArray[np.float32]) -> float:
-    """The distance in m up to which [H, W] holds measurements, but for a thousandth of them; 0 without any."""
-    measured = depth_m[depth_m > 0]
-    return float(np.percentile(measured, 99.9)) if measured.size else 0.0
-
-
-def filled(depth_m: NDArray[np.float32], range_m: float = math.inf) -> NDArray[np.float32]:
+def filled(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
     """Guess the depth of holes: near measurements that of the nearest one, farther off a smooth mean of those around.
 
     Narrow holes lie at the edges of things. Whatever is there is one of the surfaces around; a mean of them would hang
     in the air between. Wide ones are mostly surfaces that return no light, and the mean continues them: it is of
-    inverse depth, in which planes are affine, interpolated from coarser and coarser means. But what a wide hole shows
-    among surfaces at the end of the sensor's range is farther than they: a guess between them would be a wall that
-    follows the camera and stands before what it comes to measure.
+    inverse depth, in which planes are affine, interpolated from coarser and coarser means.
 
-    depth_m: [H, W], 0 = none. range_m: the farthest that the sensor has measured, see `range_of`. Measurements stay as
-    they are; an image without any comes back as it is.
+    depth_m: [H, W], 0 = none. Measurements stay as they are; an image without any comes back as it is.
     """
     valid = depth_m > 0
     if valid.all() or not valid.any():
         return depth_m
     inverse = np.where(valid, 1.0 / np.where(valid, depth_m, 1.0), 0.0).astype(np.float32)
     guess = 1.0 / np.maximum(_push_pull(inverse, valid.astype(np.float32)), 1e-3)
-    window = np.ones((2 * _NARROW_PX + 1, 2 * _NARROW_PX + 1), np.uint8)
-    near = cv2.dilate(valid.astype(np.uint8), window) > 0
-    wide = cv2.morphologyEx((~valid).astype(np.uint8), cv2.MORPH_OPEN, window) > 0
-    nearest_m = depth_m.ravel()[nearest_measured(depth_m)]
-    beyond = wide & (nearest_m > _BEYOND_SHARE * range_m)
-    guess = np.where(near, nearest_m, guess)
-    return np.where(beyond, _BEYOND * range_m, guess).astype(np.float32)
+    near = cv2.dilate(valid.astype(np.uint8), np.ones((2 * _NARROW_PX + 1, 2 * _NARROW_PX + 1), np.uint8)) > 0
+    return np.where(near, depth_m.ravel()[nearest_measured(depth_m)], guess).astype(np.float32)
 
 
 def _push_pull(value: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -16,6 +16,8 @@ from tgslam.kernels.cuda import normals as cuda_fitting
 from tgslam.types import Camera
 
 STEEPEST_RAD = 1.3  # between a surface's normal and the optical axis
+_ADOPTED_COSINE = 0.98  # of a plane's splats, whose tilts are a few degrees
+_ADOPTED_M, _ADOPTED_SIGMAS = 0.01, 1.5
 DEPTH_EDGE = 0.05  # measurements farther apart than this part of their depth lie on different surfaces
 UNGATED = (-1.0, 1.0)  # in place of what `gate_range` returns: T = 0 for a gradient of any length
 _SAMPLE_ROWS = 120  # percentiles come from a grid of about this many rows
@@ -195,6 +197,18 @@ class PlaneFits:
         else:
             fitting.fit_planes(self._settings, self._blocks, self._radius, self._fits)
         fitting.spread_normals(self._settings, depth_m, self._fits, with_depth, out)
+
+    def adopt(self, planes_c: NDArray[np.float64], surface: np.ndarray) -> None:
+        """Replace normals of surface [H, W, 4] (normal, depth in m) by those of the planes that it lies on.
+
+        planes_c: [P, 4] unit normal and offset in m of n . x + d = 0, camera frame, the normal towards the camera. A
+        pixel lies on a plane that it is off by no more than 1 cm and 1.5 sigma of the sensor's depth, and 11 degrees.
+        """
+        require("surface", surface, (self.camera.height, self.camera.width, alignment.SURFACE))
+        if len(planes_c):
+            fitting.adopt_normals(
+                self._settings, runtime.to_device(planes_c), _ADOPTED_COSINE, _ADOPTED_M, _ADOPTED_SIGMAS, surface
+            )
 
 
 def _percentile(ordered: NDArray[np.float32], percentile: float) -> float:

@@ -148,6 +148,7 @@ class Slam:
         if self.mapper.planes:
             seen = self.mapper.planes.seen_from(len(self.mapper.keyframes) - 1)
             self.structure_cue.reset(seen, keyframe.T_cw)
+            self.tracker.know_planes(np.array([(*p.normal_w, p.offset_m) for p in seen]).reshape(-1, 4))
 
     def _match_brightness(self, keyframe: Keyframe) -> None:
         previous = self.mapper.keyframes[-1]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tgslam import images, runtime
 from tgslam.config.schema import LossConfig, MappingConfig, PlanesConfig, SeedingConfig, StructureConfig
-from tgslam.depth import filled, range_of
+from tgslam.depth import filled
 from tgslam.gaussian_map import GaussianMap
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, orthonormalized, transform_points
 from tgslam.mapping.carriers import Carriers
@@ -58,7 +58,6 @@ class Mapper:
         self.keyframes: list[Keyframe] = []
         self.viewpoints = Viewpoints(rng)
         self.refiner = Refiner(camera, mapping, loss, structure=structure if self.planes else None)
-        self.range_m = 0.0  # as far as the sensor has measured
         self.carriers = Carriers(rng.spawn(1)[0])
         self.guessed = np.zeros(0, bool)  # [N] seeded where no depth was measured
         self.information = np.zeros(0)  # [N] 1/m^2, what is known of a Gaussian's depth
@@ -68,7 +67,6 @@ class Mapper:
     def add_keyframe(self, keyframe: Keyframe) -> None:
         """Take in a keyframe: weigh the evidence, clear what it knows better, insert, refine the window."""
         self.keyframes.append(keyframe)
-        self.range_m = max(self.range_m, range_of(keyframe.depth_m()))
         surface = Surface(
             keyframe, self.camera, self.gaussians, self.config.insert_sigmas * self.loss.depth_sigma_per_m2
         )
@@ -159,7 +157,7 @@ class Mapper:
         """Seed Gaussians where the map is open; where no depth was measured, at a guessed one."""
         measured_m = keyframe.depth_m()
         wanted = self._unexplained(keyframe, measured_m)
-        depth_m = filled(measured_m, self.range_m)
+        depth_m = filled(measured_m)
         colour = keyframe.exposure.gain * keyframe.colour() + np.float32(keyframe.exposure.bias)
         normals_c = runtime.to_host(
             images.normals(runtime.to_device(depth_m), self.camera, sigma_per_m2=self.loss.depth_sigma_per_m2)
@@ -248,7 +246,7 @@ class Mapper:
 
         What is beyond the sensor's range was put at its end; there it would hang before a camera that goes on.
         """
-        guess_m = filled(keyframe.depth_m(), self.range_m)
+        guess_m = filled(keyframe.depth_m())
         nearer = np.zeros(len(surface.z), bool)
         nearer[surface.inside] = surface.z[surface.inside] < _GUESS_SHARE * guess_m[surface.v, surface.u]
         return self.guessed & (surface.measured | nearer)

@@ -33,6 +33,9 @@ class FirstOrderTracker:
         self._judge = GaussNewtonTracker(camera, config, loss)
         self.rasterizer = self._judge.rasterizer
 
+    def know_planes(self, planes_w: NDArray[np.float64]) -> None:
+        """See `Tracker.know_planes`: this solver compares depths and has no use for normals."""
+
     def track(
         self,
         frame: Frame,

@@ -29,10 +29,15 @@ class GaussNewtonTracker:
         self.stopwatch: Stopwatch | None = None
         self.detector = LostDetector(config)
         self.rasterizer = Rasterizer(camera)
+        self._planes_w: NDArray[np.float64] = np.zeros((0, 4))
         first, levels = finest_level(camera, config.finest_width_px), len(config.iterations)
         self._live_pyramid = LivePyramid(camera, first, levels, loss)
         self._model_pyramid = ModelPyramid(camera, first, levels, loss, config.min_opacity, config.rim_opacity)
         self._linearise = [Lineariser(level.camera, config, loss) for level in self._live_pyramid.levels]
+
+    def know_planes(self, planes_w: NDArray[np.float64]) -> None:
+        """See `Tracker.know_planes`."""
+        self._planes_w = planes_w
 
     def track(
         self,
@@ -87,7 +92,7 @@ class GaussNewtonTracker:
         with stage(self.stopwatch, "render"):
             rendered = self.rasterizer.forward(gaussians, T_cw)
         with stage(self.stopwatch, "pyramid"):
-            return self._model_pyramid.update(rendered)
+            return self._model_pyramid.update(rendered, self._planes_w @ inverse(T_cw))
 
     def _align(
         self,

@@ -9,6 +9,7 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tgslam import images, runtime
 from tgslam.config.schema import LossConfig
@@ -89,8 +90,12 @@ class ModelPyramid:
         self._covers = [runtime.empty(size) for size in (*sizes, images.halved(sizes[-1]))]
         self._fits = [images.PlaneFits(level.camera, _NORMAL_RADIUS, loss.depth_sigma_per_m2) for level in self.levels]
 
-    def update(self, rendered: RenderImages) -> list[ModelLevel]:
-        """Take in a rendering at full size; the result is valid until the next one."""
+    def update(self, rendered: RenderImages, planes_c: NDArray[np.float64]) -> list[ModelLevel]:
+        """Take in a rendering at full size; the result is valid until the next one.
+
+        planes_c: [P, 4] known planes n . x + d = 0 in its camera's frame. What is rendered of them has their normals:
+        those of the splats are off by some 30 mrad, which would hold the camera where nothing else does.
+        """
         base = self._images.base
         images.reduce_rendering(
             rendered.colour, rendered.depth, rendered.opacity, self.min_opacity, base.grey, base.depth, self._covers[0]
@@ -102,6 +107,7 @@ class ModelPyramid:
             kernels.pack_texture(pair.grey, level.texture)
             kernels.pack_second_derivatives(level.texture)
             fits.write(pair.depth, level.surface)
+            fits.adopt(planes_c, level.surface)
             images.mark_rims(cover, self._rim_opacity, level.surface)
         return self.levels
 

@@ -26,6 +26,10 @@ class Tracker(Protocol):
     rasterizer: Rasterizer  # holds which Gaussians the last model image saw
     stopwatch: Stopwatch | None  # set it to have the stages timed, for benchmarks
 
+    def know_planes(self, planes_w: NDArray[np.float64]) -> None:
+        """The planes [P, 4] of the world that the camera is likely to see: n . x + d = 0, n towards where it is."""
+        ...
+
     def track(
         self,
         frame: Frame,
