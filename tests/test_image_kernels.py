@@ -201,6 +201,56 @@ def test_normals_without_depth_are_zero():
     assert not runtime.to_host(images.normals(lone, VGA)).any()
 
 
+def surface_of(camera, depth):
+    """[H, W, 4] of a depth image, with the fits that made it."""
+    fits = images.PlaneFits(camera, 1, 0.0015)
+    surface = runtime.zeros((camera.height, camera.width, alignment.SURFACE))
+    fits.write(runtime.to_device(depth), surface)
+    return fits, surface
+
+
+def test_adopted_normals_match_the_twin(rng):
+    camera = Camera(45, 33, 40.0, 42.0, 21.0, 17.0)
+    depth = plane_depth(camera, facing(25, 70), 1.2)
+    depth[:, 30:] = plane_depth(camera, facing(40, 200), 2.0)[:, 30:]
+    depth += 0.003 * np.sin(0.9 * np.arange(45)) + 0.012 * rng.normal(size=depth.shape).cumsum(1) / 7.0
+    depth[rng.random(depth.shape) < 0.1] = 0
+    planes = np.array([[*facing(25, 70), 1.2], [*facing(40, 200), 2.0], [*facing(27, 70), 1.215], [0, 0, 1, -1.5]])
+    fits, surface = surface_of(camera, depth)
+    before = runtime.to_host(surface).astype(float)
+    fits.adopt(planes, surface)
+    expected = reference.adopted_normals(before, planes, camera, 0.0015, 0.98, 0.01, 1.5)
+    found = runtime.to_host(surface)
+    differ = np.linalg.norm(found[..., :3] - expected, axis=2) > 1e-5
+    assert differ.mean() < 0.002  # a pixel at a threshold may fall on either side
+    np.testing.assert_array_equal(found[..., 3], before[..., 3])
+    for plane in planes[:3]:
+        assert (np.abs(expected - plane[:3]).max(2) < 1e-9).any()
+    kept = (np.abs(expected - before[..., :3]).max(2) < 1e-9) & before[..., :3].any(2)
+    assert kept.any()
+
+
+def test_of_two_near_planes_a_surface_adopts_the_one_it_is_on():
+    """A board stands 1.5 cm before its wall."""
+    depth = np.full((480, 640), 2.0)
+    depth[300:] = 1.985
+    fits, surface = surface_of(VGA, depth)
+    wall, board = np.array([*facing(1.0), 2.0]), np.array([*facing(1.0, 90.0), 1.985])
+    fits.adopt(np.array([wall, board]), surface)
+    normals = runtime.to_host(surface)[235:245, 315:325, :3]
+    np.testing.assert_allclose(normals, np.broadcast_to(wall[:3], normals.shape), atol=1e-6)
+    below = np.abs(runtime.to_host(surface)[310:330, 315:325, :3] - board[:3]).max(2) < 1e-6
+    assert below.all()
+
+
+def test_without_planes_and_on_none_of_them_normals_stay():
+    fits, surface = surface_of(VGA, plane_depth(VGA, facing(30), 1.5))
+    before = runtime.to_host(surface).copy()
+    for planes in (np.zeros((0, 4)), np.array([[*facing(30), 1.7], [*facing(50), 1.5], [*-facing(30), -1.5]])):
+        fits.adopt(planes, surface)
+        np.testing.assert_array_equal(runtime.to_host(surface), before)
+
+
 def test_wrong_images_are_named():
     with pytest.raises(ValueError, match=r"colour must have shape \[any, any, 3\]"):
         images.luminance(runtime.zeros((4, 4)))

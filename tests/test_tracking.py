@@ -291,6 +291,33 @@ def exact_tracker(scene: Planes, config: TrackingConfig = CONFIG) -> GaussNewton
 MOTION = se3_exp([0.005, -0.01, 0.004, 0.01, 0.004, -0.006])
 
 
+class Rippled(Planes):
+    """The rendered depth strays from the planes by a millimetre or two, as splats make it."""
+
+    def forward(self, gaussians: GaussianMap | None, T_cw: np.ndarray) -> RenderImages:
+        frame = self.frame(T_cw)
+        v, u = np.mgrid[: self.camera.height, : self.camera.width]
+        depth_m = frame.depth_m + np.float32(0.0015) * np.sin(0.7 * u + 0.5 * v).astype(np.float32)
+        images = (frame.colour, depth_m, np.ones_like(depth_m), np.zeros_like(frame.colour))
+        return RenderImages(*(runtime.to_device(image) for image in images))
+
+
+def test_ripples_on_a_known_plane_do_not_hold_the_camera_along_it():
+    scene = Rippled((WALL,), camera=Camera(320, 240, 250.0, 250.0, 159.5, 119.5))
+    normal = np.array(WALL[0]) / np.linalg.norm(WALL[0])
+    plane_w = np.array([[*normal, WALL[1] / np.linalg.norm(WALL[0])]])
+    along = np.array([0.0, 0.0, 0.0, *np.cross(normal, [0.0, 1.0, 0.0])])
+    unknown, known = exact_tracker(scene), exact_tracker(scene)
+    known.know_planes(plane_w)
+    held = [
+        along @ one.track(scene.frame(np.eye(4)), None, np.eye(4), Exposure()).information @ along
+        for one in (unknown, known)
+    ]
+    assert held[1] < 0.01 * held[0]
+    result = known.track(scene.frame(MOTION), None, np.eye(4), Exposure())
+    assert abs(normal @ (inverse(result.T_cw) - inverse(MOTION))[:3, 3]) < 5e-4
+
+
 def test_three_planes_determine_the_pose_without_any_texture():
     scene = Planes((WALL, SIDE, FLOOR))
     result = exact_tracker(scene).track(scene.frame(MOTION), None, np.eye(4), Exposure())

@@ -101,3 +101,16 @@ def rim(half_cover, whole, shape):
     rows = np.minimum(np.arange(shape[0]) // 2, half_cover.shape[0] - 1)
     columns = np.minimum(np.arange(shape[1]) // 2, half_cover.shape[1] - 1)
     return (mean_around(half_cover) < whole)[np.ix_(rows, columns)]
+
+
+def adopted_normals(surface, planes, camera, sigma, least_cosine, slack_m, sigmas):
+    """Normals [H, W, 3] of surface [H, W, 4], each the nearest plane's where it lies on one."""
+    out = surface[..., :3].copy()
+    for v, u in np.ndindex(out.shape[:2]):
+        z, ray = surface[v, u, 3], np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0])
+        nearest = slack_m + sigmas * sigma * z**2
+        for plane in planes:
+            off = abs(z * (plane[:3] @ ray) + plane[3])
+            if off < nearest and surface[v, u, :3] @ plane[:3] > least_cosine:
+                nearest, out[v, u] = off, plane[:3]
+    return out

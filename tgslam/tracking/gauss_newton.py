@@ -13,7 +13,7 @@ from tgslam.stopwatch import Stopwatch, stage
 from tgslam.tracking.exposure import Exposure, fit_exposure
 from tgslam.tracking.linearisation import Lineariser, NormalEquations
 from tgslam.tracking.lost import LostDetector
-from tgslam.tracking.pyramid import LiveLevel, LivePyramid, ModelLevel, ModelPyramid, finest_level
+from tgslam.tracking.pyramid import NO_PLANES, LiveLevel, LivePyramid, ModelLevel, ModelPyramid, finest_level
 from tgslam.tracking.result import TrackingResult
 from tgslam.types import Camera, Frame
 
@@ -29,7 +29,7 @@ class GaussNewtonTracker:
         self.stopwatch: Stopwatch | None = None
         self.detector = LostDetector(config)
         self.rasterizer = Rasterizer(camera)
-        self._planes_w: NDArray[np.float64] = np.zeros((0, 4))
+        self._planes_w = NO_PLANES
         first, levels = finest_level(camera, config.finest_width_px), len(config.iterations)
         self._live_pyramid = LivePyramid(camera, first, levels, loss)
         self._model_pyramid = ModelPyramid(camera, first, levels, loss, config.min_opacity, config.rim_opacity)

@@ -18,6 +18,8 @@ from tgslam.kernels import image as kernels
 from tgslam.render import RenderImages
 from tgslam.types import Camera, Frame
 
+NO_PLANES: NDArray[np.float64] = np.zeros((0, 4))
+
 _NORMAL_RADIUS = 1  # blocks of 2x2 px on each side: a rendered surface has little noise
 
 
@@ -90,7 +92,7 @@ class ModelPyramid:
         self._covers = [runtime.empty(size) for size in (*sizes, images.halved(sizes[-1]))]
         self._fits = [images.PlaneFits(level.camera, _NORMAL_RADIUS, loss.depth_sigma_per_m2) for level in self.levels]
 
-    def update(self, rendered: RenderImages, planes_c: NDArray[np.float64]) -> list[ModelLevel]:
+    def update(self, rendered: RenderImages, planes_c: NDArray[np.float64] = NO_PLANES) -> list[ModelLevel]:
         """Take in a rendering at full size; the result is valid until the next one.
 
         planes_c: [P, 4] known planes n . x + d = 0 in its camera's frame. What is rendered of them has their normals:

@@ -34,6 +34,12 @@ def _camera(height: int, width: int) -> Camera:
     return Camera(width, height, 0.9 * width, 0.95 * width, 0.5 * width - 0.3, 0.5 * height - 0.8)
 
 
+def _slanted(camera: Camera) -> np.ndarray:
+    """Normal towards the camera that the surface of `_view` has near the middle of the image."""
+    normal = np.array([0.005 * camera.fx, -0.003 * camera.fy, -1.0])
+    return normal / np.linalg.norm(normal)
+
+
 def _rendering(height: int, width: int) -> RenderImages:
     """Of a map that covers the right third of the image in part only."""
     colour, depth_m = _view(height, width, seed=1)
@@ -48,7 +54,10 @@ def levels(height: int = 37, width: int = 50, first: int = 1) -> dict[str, np.nd
     """Everything that alignment reads, at two resolutions."""
     camera = _camera(height, width)
     live = LivePyramid(camera, first, 2, _LOSS).update(Frame(0, 0.0, *_view(height, width, seed=0)))
-    model = ModelPyramid(camera, first, 2, _LOSS, _MIN_OPACITY, _RIM_OPACITY).update(_rendering(height, width))
+    planes_c = np.array([[*facing, 1.95] for facing in (_slanted(camera), -np.eye(3)[2])])
+    model = ModelPyramid(camera, first, 2, _LOSS, _MIN_OPACITY, _RIM_OPACITY).update(
+        _rendering(height, width), planes_c
+    )
     result = {}
     for k in range(2):
         result[f"gate_{k}"] = np.array([live[k].gate_low, live[k].gate_inverse_range])
