@@ -14,7 +14,7 @@ from tgslam.geometry import matrix_from_quat_wxyz
 from tgslam.plane_regularisers import PlaneRegularisers
 from tgslam.types import Gaussians
 
-CONFIG = StructureConfig(lambda_str=0.6, omega_flat=1.3, omega_normal=0.8, omega_distance=0.4)
+CONFIG = StructureConfig(lambda_str=0.6, omega_flat=1.3, omega_normal=0.8, omega_distance=0.4, sigma_distance_m=0.01)
 PARTS = ("flat", "normal", "distance")
 MOVED = ("mean", "log_scale", "quat_wxyz")
 

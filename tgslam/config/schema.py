@@ -238,9 +238,9 @@ class StructureConfig:
     lambda_str: float = setting(0.05, 0.0, 100.0)  # what E_str weighs; 0 = no regularisers
     omega_flat: float = setting(1.0, 0.0, 100.0)  # of Eq. 8, scales relative to sqrt(s1 s2)
     omega_normal: float = setting(0.3, 0.0, 100.0)  # of Eq. 9
-    omega_distance: float = setting(0.1, 0.0, 100.0)  # of the distance to the plane
+    omega_distance: float = setting(0.4, 0.0, 100.0)  # of the distance to the plane
     thinness: float = setting(0.1, 0.0, 1.0)  # k of Eq. 8
-    sigma_distance_m: float = setting(0.01, 1e-5, 1.0)  # farther off, a Gaussian is left where it is
+    sigma_distance_m: float = setting(0.03, 1e-5, 1.0)  # farther off, a Gaussian is left where it is
 
 
 @dataclass(frozen=True)
