@@ -15,8 +15,8 @@ _TOLERANCE_SIGMAS = 4.2  # three sigma of a difference of two measurements
 _STEEPEST = 5.7  # tangent of 80 degrees
 _MIN_NEIGHBOURS = 4
 _RANGE_SIGMAS = 3.0  # nearer to the farthest measurement than this, noise decides what is in range
-_RANGE_WINDOW_PX = 9
-_RANGE_SHARE = 0.9  # of the window that has depth; then a surface reads at most 0.2 sigma too near
+_RANGE_WINDOW_PX = 17  # much wider than the seams without depth along edges
+_RANGE_SHARE = 0.85  # of the window that has depth; then a surface reads at most 0.3 sigma too near
 _NARROW_PX = 2  # a hole's pixels that are no farther from a measurement are at an edge
 
 
