@@ -20,11 +20,14 @@ _GRID = (40, 30)  # Gaussians in a row, rows
 
 
 def _facing(frame: Frame, camera: Camera) -> Gaussians:
-    """Gaussians on the surface that a frame sees, a little too dark, and some more behind the camera."""
+    """Gaussians on the surface that a frame sees, a little too dark and too far, and some more behind the camera.
+
+    Where a gradient is about 0, rounding decides which way Adam's first steps go.
+    """
     columns, rows = np.linspace(1, camera.width - 2, _GRID[0]), np.linspace(1, camera.height - 2, _GRID[1])
     u, v = (pixel.ravel() for pixel in np.meshgrid(columns, rows))
     at = v.astype(int), u.astype(int)
-    z = np.where(frame.depth_m[at] > 0, frame.depth_m[at], 2.0)
+    z = 1.005 * np.where(frame.depth_m[at] > 0, frame.depth_m[at], 2.0)
     mean = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], 1) * z[:, None]
     mean[::9] *= -1.0
     n, size = len(z), z * camera.width / _GRID[0] / camera.fx
