@@ -36,7 +36,7 @@ def without_range_limit(depth_m: NDArray[np.float32], sigma_per_m2: float) -> ND
 
     Of such a surface a sensor gives those pixels that noise brings near, up to 2 sigma too near in the mean. They are
     told by pixels without depth around them, among what is as far as the farthest measurement but for noise.
-    depth_m: [H, W], 0 = none. sigma_per_m2: sensor noise, sigma_z = this * z^2. Returns a new array or the same one.
+    depth_m: [H, W], 0 = none. sigma_per_m2: sensor noise, sigma_z = this * z^2. Returns a new array.
     """
     far_m = float(depth_m.max(initial=0.0))
     limit = depth_m > far_m - _RANGE_SIGMAS * sigma_per_m2 * far_m**2
