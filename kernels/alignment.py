@@ -48,10 +48,11 @@ PADDED_SUMS = PACKED_SUMS * LANES
     WEIGHT_COLOUR,
     WEIGHT_GRADIENT,
     SURFACE_SIGMA,  # m, the map's own error, added to the sensor's in the weights
+    LIVE_SHARE,  # of the measured depth in the one that noise is taken at; the model's has the rest
     GATE_LOW,  # G_min of Eq. 11, 1/px
     GATE_INVERSE_RANGE,  # 1 / (G_max - G_min + epsilon)
     POSE,
-) = range(19)
+) = range(20)
 SETTINGS = POSE + 12
 
 # What a live pixel holds: m, intensity, its gradient and that one's length (G of Eq. 10) in 1/px
@@ -214,8 +215,10 @@ def add_residuals(
     # at the map's rim colours fade into black: a pull that does not depend on the pose
     firm = indicator(filled(z, 0.0), surface_depth)
     # depth: e is the length of the residual, whose sign is the distance's
-    # by the model's depth: by the measured one, what errs towards the camera would count for more
-    expected = larger(model_depth, filled(z, MIN_DEPTH_M))
+    # by the model's depth: by the measured one, what errs towards the camera would count for more. Of a model that errs
+    # as much, by the mean of both
+    share = settings[LIVE_SHARE]
+    expected = larger(share * z + (1.0 - share) * model_depth, filled(z, MIN_DEPTH_M))
     sensor = settings[DEPTH_SIGMA] * expected * expected
     has_normal = indicator(filled(z, 0.5), nx * nx + ny * ny + nz * nz)
     length = ti.sqrt(ray_x * ray_x + ray_y * ray_y + 1.0)

@@ -144,6 +144,7 @@ def test_sums_match_the_twin(size, seed):
         {"charbonnier_depth": 0.2, "sigma_gradient": 0.005, "sigma_colour": 0.01},
         {"max_distance_sigmas": 2.0},
         {"surface_sigma": 0.004},
+        {"live_share": 0.5},
     ],
 )
 def test_each_setting_is_honoured(changes):

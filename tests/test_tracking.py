@@ -7,6 +7,8 @@ from functools import cache
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.special import ndtr
 
 from tests.reference import alignment as reference
@@ -24,7 +26,8 @@ from tgslam.tracking.first_order import FirstOrderTracker
 from tgslam.tracking.gauss_newton import GaussNewtonTracker
 from tgslam.tracking.lost import LostDetector
 from tgslam.tracking.motion import ConstantVelocity
-from tgslam.tracking.pyramid import LiveLevel, LivePyramid, ModelLevel, ModelPyramid, finest_level
+from tgslam.tracking.pyramid import NO_PLANES, LiveLevel, LivePyramid, ModelLevel, ModelPyramid, finest_level
+from tgslam.tracking.reference import Reference
 from tgslam.tracking.result import TrackingResult
 from tgslam.tracking.solver import make_tracker, track_or_recover
 from tgslam.types import Camera, Frame
@@ -247,7 +250,7 @@ def test_an_absurd_contrast_is_no_exposure(slope):
 
 # --- information, on scenes that are rendered exactly from any pose ---
 
-TINY = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+TINY, LARGE = Camera(64, 48, 50.0, 50.0, 31.5, 23.5), Camera(320, 240, 250.0, 250.0, 159.5, 119.5)
 WALL, SIDE, FLOOR = ((0.1, 0.05, -1.0), 3.0), ((-1.0, 0.0, 0.0), 1.2), ((0.0, -1.0, 0.0), 0.8)
 
 
@@ -303,12 +306,12 @@ class Rippled(Planes):
 
 
 def test_ripples_on_a_known_plane_do_not_hold_the_camera_along_it():
-    scene = Rippled((WALL,), camera=Camera(320, 240, 250.0, 250.0, 159.5, 119.5))
+    scene = Rippled((WALL,), camera=LARGE)
     normal = np.array(WALL[0]) / np.linalg.norm(WALL[0])
     plane_w = np.array([[*normal, WALL[1] / np.linalg.norm(WALL[0])]])
     along = np.array([0.0, 0.0, 0.0, *np.cross(normal, [0.0, 1.0, 0.0])])
     unknown, known = exact_tracker(scene), exact_tracker(scene)
-    known.know_planes(plane_w)
+    known.know(plane_w, [])
     held = [
         along @ one.track(scene.frame(np.eye(4)), None, np.eye(4), Exposure()).information @ along
         for one in (unknown, known)
@@ -316,6 +319,67 @@ def test_ripples_on_a_known_plane_do_not_hold_the_camera_along_it():
     assert held[1] < 0.01 * held[0]
     result = known.track(scene.frame(MOTION), None, np.eye(4), Exposure())
     assert abs(normal @ (inverse(result.T_cw) - inverse(MOTION))[:3, 3]) < 5e-4
+
+
+class Farther(Planes):
+    """What is rendered lies too far off, by 6 mm."""
+
+    OFF_M = 0.006
+
+    def forward(self, gaussians: GaussianMap | None, T_cw: np.ndarray) -> RenderImages:
+        frame = self.frame(T_cw)
+        depth_m = frame.depth_m + np.float32(self.OFF_M)
+        images = (frame.colour, depth_m, np.ones_like(depth_m), np.zeros_like(frame.colour))
+        return RenderImages(*(runtime.to_device(image) for image in images))
+
+
+def test_keyframes_as_they_were_measured_count_as_much_as_the_map():
+    """A map too far off draws the camera forward; of three that are aligned to, two exact ones leave a third of it."""
+    config = replace(CONFIG, references=2, weight_colour=0.0, weight_gradient=0.0)
+    scene = Farther((WALL, SIDE, FLOOR), camera=LARGE)
+    poses = [se3_exp([0.01, -0.02, 0.005, -0.02, 0.01, 0.03]), se3_exp([-0.01, 0.01, 0.0, 0.015, 0.0, -0.02]), MOTION]
+    frames = [(scene.frame(T_cw), T_cw) for T_cw in poses]
+    keyframes = [Reference(f.colour, f.depth_m, T_cw, Exposure()) for f, T_cw in frames]
+    forward_m = []
+    for count in range(4):  # more are given than are used
+        tracker = exact_tracker(scene, config)
+        tracker.know(NO_PLANES, keyframes[:count])
+        result = tracker.track(scene.frame(MOTION), None, np.eye(4), Exposure())
+        forward_m.append((MOTION @ inverse(result.T_cw))[2, 3])
+    assert forward_m[0] == pytest.approx(scene.OFF_M, rel=0.2)
+    np.testing.assert_allclose(forward_m, forward_m[0] / np.array([1, 2, 3, 3]), rtol=0.05)
+
+
+def test_what_is_known_replaces_what_was():
+    scene = Farther((WALL, SIDE, FLOOR))
+    frame = scene.frame(MOTION)
+    tracker = exact_tracker(scene)
+    first = tracker.track(frame, None, np.eye(4), Exposure())
+    tracker.know(NO_PLANES, [Reference(frame.colour, frame.depth_m, MOTION, Exposure())])
+    assert not np.array_equal(tracker.track(frame, None, np.eye(4), Exposure()).T_cw, first.T_cw)
+    tracker.know(NO_PLANES, [])
+    np.testing.assert_array_equal(tracker.track(frame, None, np.eye(4), Exposure()).T_cw, first.T_cw)
+
+
+@pytest.mark.parametrize("gain", [0.7, 1.3])
+def test_a_keyframe_of_another_exposure_draws_neither_pose_nor_gain(gain):
+    """map intensity = gain * frame intensity: the keyframe is darker or brighter than the map, and so is the frame."""
+    scene = Planes((WALL, SIDE, FLOOR), contrast=0.2)
+    seen, T_cw = scene.frame(np.eye(4)), np.eye(4)
+    tracker = exact_tracker(scene)
+    tracker.know(NO_PLANES, [Reference(seen.colour / np.float32(gain), seen.depth_m, T_cw, Exposure(gain))])
+    result = tracker.track(with_exposure(scene.frame(MOTION), 0.9), None, np.eye(4), Exposure(1.0 / 0.9))
+    angle_deg, distance_mm = error(result.T_cw, inverse(MOTION))
+    assert angle_deg < 0.05 and distance_mm < 1.0
+    assert result.exposure.gain == pytest.approx(1.0 / 0.9, rel=0.01)
+
+
+@given(gains=st.tuples(*[st.floats(0.5, 2.0)] * 2), biases=st.tuples(*[st.floats(-0.2, 0.2)] * 2), x=st.floats(0, 1))
+def test_an_exposure_relative_to_another_leads_to_the_other_image(gains, biases, x):
+    one, other = (Exposure(*pair) for pair in zip(gains, biases, strict=True))
+    between = one.relative_to(other)
+    in_other = between.gain * x + between.bias
+    assert other.gain * in_other + other.bias == pytest.approx(one.gain * x + one.bias, abs=1e-9)
 
 
 def test_three_planes_determine_the_pose_without_any_texture():
@@ -412,9 +476,9 @@ def test_the_information_is_how_the_cost_grows_with_the_pose():
         TINY.fx, TINY.fy, TINY.cx, TINY.cy, result.exposure.gain, result.exposure.bias,
         loss.depth_sigma_per_m2, CONFIG.max_distance_sigmas, loss.charbonnier_depth_sigmas, loss.gate_depth_boost,
         CONFIG.sigma_colour, CONFIG.sigma_gradient, CONFIG.weight_depth, CONFIG.weight_colour, CONFIG.weight_gradient,
-        config.surface_sigma_m,
+        config.surface_sigma_m, 0.0,
     )  # fmt: skip
-    assert len(fields(settings)) == 16
+    assert len(fields(settings)) == 17
 
     def cost(xi: np.ndarray) -> float:
         return reference.cost(settings, T_mw @ inverse(se3_exp(xi) @ result.T_cw), live, model)

@@ -23,6 +23,8 @@ from tgslam.mapping.mapper import Mapper
 from tgslam.planes.cue import StructureCue
 from tgslam.tracking.exposure import Exposure
 from tgslam.tracking.motion import ConstantVelocity
+from tgslam.tracking.pyramid import NO_PLANES
+from tgslam.tracking.reference import Reference
 from tgslam.tracking.result import TrackingResult
 from tgslam.tracking.solver import make_tracker, track_or_recover
 from tgslam.types import Camera, Frame, FrameReport, FrameStatus, Gaussians, Plane, Trajectory
@@ -48,6 +50,7 @@ class Slam:
 
     def __init__(self, camera: Camera, config: Config) -> None:
         self.camera, self.sigma_per_m2 = camera, config.loss.depth_sigma_per_m2
+        self._reference_count = config.tracking.references
         self._matches_brightness = config.tracking.exposure == "gain"
         self.tracker = make_tracker(camera, config.tracking, config.loss)
         self.motion = ConstantVelocity(config.tracking)
@@ -145,10 +148,19 @@ class Slam:
         self._posed.append(_Posed(frame.timestamp_s, keyframe, np.eye(4)))
         self.tracker.rasterizer.forward(self.mapper.gaussians, keyframe.T_cw)
         self.selector.reset(frame, keyframe.T_cw, self.tracker.rasterizer.visible(self.mapper.gaussians.count))
+        planes_w = NO_PLANES
         if self.mapper.planes:
             seen = self.mapper.planes.seen_from(len(self.mapper.keyframes) - 1)
             self.structure_cue.reset(seen, keyframe.T_cw)
-            self.tracker.know_planes(np.array([(*p.normal_w, p.offset_m) for p in seen]).reshape(-1, 4))
+            planes_w = np.array([(*p.normal_w, p.offset_m) for p in seen]).reshape(-1, 4)
+        self.tracker.know(planes_w, self._references())
+
+    def _references(self) -> list[Reference]:
+        """The last keyframe, and those before it that most of the map in its view was seeded from."""
+        last = self.mapper.keyframes[-1]
+        before = sorted(last.seen, key=lambda number: -last.seen[number])
+        chosen = [last, *(self.mapper.keyframes[number] for number in before)][: self._reference_count]
+        return [Reference(k.colour(), k.depth_m(), k.T_cw, k.exposure) for k in chosen]
 
     def _match_brightness(self, keyframe: Keyframe) -> None:
         previous = self.mapper.keyframes[-1]

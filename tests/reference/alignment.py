@@ -6,7 +6,7 @@ import numpy as np
 
 from tgslam.geometry import hat
 
-NEAR_M, MIN_COSINE, INLIER_SIGMAS = 0.05, 0.2, 3.0
+NEAR_M, MIN_COSINE, INLIER_SIGMAS, MIN_DEPTH_M = 0.05, 0.2, 3.0, 1e-3
 
 
 @dataclass
@@ -27,6 +27,7 @@ class Settings:
     weight_colour: float = 0.1
     weight_gradient: float = 0.1
     surface_sigma: float = 0.0
+    live_share: float = 0.0
 
 
 @dataclass
@@ -96,7 +97,7 @@ def pixel(s, T_ml, live, model, u, v):
         return None
     n = model["normal"][vn, un]
     distance, cosine = n @ (x - back_project(s, un, vn, zm)), max(-n @ ray / np.linalg.norm(ray), MIN_COSINE)
-    sensor = s.depth_sigma * zm**2
+    sensor = s.depth_sigma * max(s.live_share * x[2] + (1 - s.live_share) * zm, MIN_DEPTH_M) ** 2
     along = abs(distance) / cosine if n.any() else abs(x[2] - zm)
     if along >= s.max_distance_sigmas * sensor:
         return Pixel(matched=False)

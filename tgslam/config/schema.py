@@ -80,6 +80,7 @@ class TrackingConfig:
     finest_width_px: int = setting(400, 16, 4096)  # images are halved until they are at most this wide
     # Gauss-Newton steps at most, by level of the image pyramid, fine to coarse; each is half the size of the one before
     iterations: tuple[int, ...] = setting((4, 6, 8), 1, 1000, min_items=1)
+    references: int = setting(2, 0, 8)  # keyframes whose own images a frame is aligned to, beside the map
     renders: int = setting(1, 1, 5)  # the map is rendered this often at the latest estimate
     sigma_colour: float = setting(0.05, 1e-4, 1.0)  # intensity residual of weight 1
     sigma_gradient: float = setting(0.02, 1e-4, 1.0)  # gradient residual of weight 1, 1/px
@@ -146,7 +147,7 @@ class MappingConfig:
     anchor_count: int = setting(2, 0, 1000)  # SGVs, whose poses hold still
     iterations: int = setting(12, 0, 10_000)  # views rendered and refined a keyframe
     final_iterations: int = setting(60, 0, 1_000_000)  # after the last frame, over all keyframes; 0 = off
-    refine_poses: bool = setting(True)
+    refine_poses: bool = setting(False)
     insert_opacity: float = setting(0.6, 0.0, 1.0)  # the map does not explain a pixel that it covers less than this
     insert_sigmas: float = setting(8.0, 0.0, 1000.0)  # nor one whose surface stands this far in front of the map's
     coarse_factor: float = setting(2.5, 1.0, 100.0)  # Gaussians this much larger than needed are seeded anew, finer

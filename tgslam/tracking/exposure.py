@@ -12,6 +12,10 @@ class Exposure:
     gain: float = 1.0
     bias: float = 0.0
 
+    def relative_to(self, other: Exposure) -> Exposure:
+        """That of the same frame against another frame's image, whose exposure is `other`."""
+        return Exposure(self.gain / other.gain, (self.bias - other.bias) / other.gain)
+
 
 @dataclass(frozen=True)
 class IntensityMoments:

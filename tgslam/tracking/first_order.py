@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +16,7 @@ from tgslam.stopwatch import Stopwatch, stage
 from tgslam.tracking.exposure import Exposure
 from tgslam.tracking.gauss_newton import GaussNewtonTracker
 from tgslam.tracking.pyramid import finest_level
+from tgslam.tracking.reference import Reference
 from tgslam.tracking.result import TrackingResult
 from tgslam.types import Camera, Frame
 from tgslam.vector_adam import VectorAdam
@@ -33,8 +36,8 @@ class FirstOrderTracker:
         self._judge = GaussNewtonTracker(camera, config, loss)
         self.rasterizer = self._judge.rasterizer
 
-    def know_planes(self, planes_w: NDArray[np.float64]) -> None:
-        """See `Tracker.know_planes`: this solver compares depths and has no use for normals."""
+    def know(self, planes_w: NDArray[np.float64], references: Sequence[Reference]) -> None:
+        """See `Tracker.know`: this solver, as the paper's, compares the frame with what is rendered, and no more."""
 
     def track(
         self,

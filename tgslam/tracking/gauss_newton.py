@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,7 +15,16 @@ from tgslam.stopwatch import Stopwatch, stage
 from tgslam.tracking.exposure import Exposure, fit_exposure
 from tgslam.tracking.linearisation import Lineariser, NormalEquations
 from tgslam.tracking.lost import LostDetector
-from tgslam.tracking.pyramid import NO_PLANES, LiveLevel, LivePyramid, ModelLevel, ModelPyramid, finest_level
+from tgslam.tracking.pyramid import (
+    NO_PLANES,
+    LiveLevel,
+    LivePyramid,
+    ModelLevel,
+    ModelPyramid,
+    ReferencePyramid,
+    finest_level,
+)
+from tgslam.tracking.reference import Reference
 from tgslam.tracking.result import TrackingResult
 from tgslam.types import Camera, Frame
 
@@ -33,11 +44,17 @@ class GaussNewtonTracker:
         first, levels = finest_level(camera, config.finest_width_px), len(config.iterations)
         self._live_pyramid = LivePyramid(camera, first, levels, loss)
         self._model_pyramid = ModelPyramid(camera, first, levels, loss, config.min_opacity, config.rim_opacity)
+        self._reference_pyramids = [ReferencePyramid(camera, first, levels, loss) for _ in range(config.references)]
+        self._references: list[tuple[list[ModelLevel], Reference]] = []
         self._linearise = [Lineariser(level.camera, config, loss) for level in self._live_pyramid.levels]
 
-    def know_planes(self, planes_w: NDArray[np.float64]) -> None:
-        """See `Tracker.know_planes`."""
+    def know(self, planes_w: NDArray[np.float64], references: Sequence[Reference]) -> None:
+        """See `Tracker.know`."""
         self._planes_w = planes_w
+        self._references = [
+            (pyramid.update(reference, planes_w @ inverse(reference.T_cw)), reference)
+            for pyramid, reference in zip(self._reference_pyramids, references, strict=False)
+        ]
 
     def track(
         self,
@@ -54,7 +71,7 @@ class GaussNewtonTracker:
         for _ in range(self.config.renders):
             model = self._model(gaussians, T_cw)
             with stage(self.stopwatch, "align"):
-                T_ml, exposure, last = self._align(live, model, exposure, predicted @ inverse(T_cw), prior)
+                T_ml, exposure, last = self._align(live, model, T_cw, exposure, predicted @ inverse(T_cw), prior)
             T_cw = inverse(T_ml) @ T_cw
         return self._result(T_cw, T_ml, exposure, last)
 
@@ -98,19 +115,21 @@ class GaussNewtonTracker:
         self,
         live: list[LiveLevel],
         model: list[ModelLevel],
+        T_mw: NDArray[np.float64],
         exposure: Exposure,
         T_pm: NDArray[np.float64],
         prior: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], Exposure, NormalEquations]:
         """Coarse to fine from the identity; returns T_ml, the exposure, and the last equations.
 
+        T_mw: world to where the model was rendered.
         T_pm: from where the model was rendered to the predicted camera, which `prior` [6, 6] draws the pose to, at the
         finest level. Coarser ones have fewer pixels to hold against it, so it counts as much less there.
         """
         T_ml = np.eye(4)
         for level in reversed(range(len(live))):
             for _ in range(self.config.iterations[level]):
-                equations = self._linearise[level](live[level], model[level], T_ml, exposure)
+                equations = self._equations(level, live[level], model[level], T_mw, T_ml, exposure)
                 exposure = fit_exposure(equations.intensity, self.config.exposure, exposure)
                 # a weak damping holds the directions that nothing observes
                 damping = _DAMPING * np.trace(equations.A) + 1e-9
@@ -121,3 +140,20 @@ class GaussNewtonTracker:
                 if np.abs(step).max() < _CONVERGED:
                     break
         return T_ml, exposure, equations
+
+    def _equations(
+        self,
+        level: int,
+        live: LiveLevel,
+        model: ModelLevel,
+        T_mw: NDArray[np.float64],
+        T_ml: NDArray[np.float64],
+        exposure: Exposure,
+    ) -> NormalEquations:
+        """Of the map and of the references; what is said of the match is said of the map's."""
+        equations = self._linearise[level](live, model, T_ml, exposure)
+        for levels, reference in self._references:
+            T_rm = reference.T_cw @ inverse(T_mw)
+            between = exposure.relative_to(reference.exposure)
+            equations = equations.joined(self._linearise[level](live, levels[level], T_rm @ T_ml, between), T_rm)
+        return equations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tgslam import runtime
 from tgslam.config.schema import LossConfig, TrackingConfig
+from tgslam.geometry import adjoint
 from tgslam.kernels import alignment
 from tgslam.kernels.cuda import alignment as cuda
 from tgslam.tracking.exposure import Exposure, IntensityMoments
@@ -32,6 +33,11 @@ class NormalEquations:
     depth_residual: float  # mean, in sigmas
     colour_residual: float  # mean, in intensity
     intensity: IntensityMoments
+
+    def joined(self, other: NormalEquations, T_om: NDArray[np.float64]) -> NormalEquations:
+        """With those of another model, whose camera is T_om [4, 4] from this one's; the statistics are this one's."""
+        moved = adjoint(T_om)
+        return replace(self, A=self.A + moved.T @ other.A @ moved, b=self.b + moved.T @ other.b)
 
 
 class _Kernels(Protocol):
@@ -110,6 +116,7 @@ class Lineariser:
         """The sums [SUMS] over all pixels, in the kernel's order."""
         settings = self._settings
         settings[alignment.GAIN], settings[alignment.BIAS] = exposure.gain, exposure.bias
+        settings[alignment.LIVE_SHARE] = 0.5 if model.measured else 0.0
         settings[alignment.GATE_LOW] = live.gate_low
         settings[alignment.GATE_INVERSE_RANGE] = live.gate_inverse_range
         settings[alignment.POSE :] = T_ml[:3].reshape(12)

@@ -16,11 +16,13 @@ from tgslam.config.schema import LossConfig
 from tgslam.kernels import alignment
 from tgslam.kernels import image as kernels
 from tgslam.render import RenderImages
+from tgslam.tracking.reference import Reference
 from tgslam.types import Camera, Frame
 
 NO_PLANES: NDArray[np.float64] = np.zeros((0, 4))
 
-_NORMAL_RADIUS = 1  # blocks of 2x2 px on each side: a rendered surface has little noise
+# blocks of 2x2 px on each side: a rendered surface has little noise, and wide fits of a measured one round its edges
+_NORMAL_RADIUS = 1
 
 
 @dataclass
@@ -35,11 +37,12 @@ class LiveLevel:
 
 @dataclass(frozen=True)
 class ModelLevel:
-    """One resolution of the rendered model."""
+    """One resolution of what a frame is aligned to: of the rendered map, or of a keyframe as it was measured."""
 
     camera: Camera
     surface: np.ndarray  # device array [H, W, SURFACE], see `kernels.alignment`; no depth where the map says nothing
     texture: np.ndarray  # device array [H, W, TEXTURE]
+    measured: bool = False  # its depth is as noisy as the frame's
 
 
 def finest_level(camera: Camera, finest_width_px: int) -> int:
@@ -106,11 +109,26 @@ class ModelPyramid:
             images.halve(cover, half)
         half_covers = self._covers[-len(self.levels) :]
         for level, pair, fits, cover in zip(self.levels, self._images.halvings(), self._fits, half_covers, strict=True):
-            kernels.pack_texture(pair.grey, level.texture)
-            kernels.pack_second_derivatives(level.texture)
-            fits.write(pair.depth, level.surface)
-            fits.adopt(planes_c, level.surface)
+            _write_model(level, pair, fits, planes_c)
             images.mark_rims(cover, self._rim_opacity, level.surface)
+        return self.levels
+
+
+class ReferencePyramid:
+    """Levels of a keyframe's own images, made just like those of the frame that is aligned to them."""
+
+    def __init__(self, camera: Camera, first: int, levels: int, loss: LossConfig) -> None:
+        self._images = _ImagePyramid(camera, first, levels)
+        self.levels = [_model_level(camera.halved(first + level), measured=True) for level in range(levels)]
+        self._fits = [images.PlaneFits(level.camera, _NORMAL_RADIUS, loss.depth_sigma_per_m2) for level in self.levels]
+
+    def update(self, reference: Reference, planes_c: NDArray[np.float64]) -> list[ModelLevel]:
+        """Take in a keyframe; the result is valid until the next one. planes_c: see `ModelPyramid.update`."""
+        base = self._images.base
+        colour, depth_m = runtime.to_device(reference.colour), runtime.to_device(reference.depth_m)
+        images.reduce_frame(colour, depth_m, base.grey, base.depth)
+        for level, pair, fits in zip(self.levels, self._images.halvings(), self._fits, strict=True):
+            _write_model(level, pair, fits, planes_c)
         return self.levels
 
 
@@ -150,9 +168,17 @@ def _live_level(camera: Camera) -> LiveLevel:
     return LiveLevel(camera, runtime.empty((camera.height, blocks, alignment.LIVE, alignment.LANES)))
 
 
-def _model_level(camera: Camera) -> ModelLevel:
+def _model_level(camera: Camera, *, measured: bool = False) -> ModelLevel:
     size = (camera.height, camera.width)
-    return ModelLevel(camera, runtime.zeros((*size, alignment.SURFACE)), runtime.zeros((*size, alignment.TEXTURE)))
+    surface, texture = runtime.zeros((*size, alignment.SURFACE)), runtime.zeros((*size, alignment.TEXTURE))
+    return ModelLevel(camera, surface, texture, measured)
+
+
+def _write_model(level: ModelLevel, pair: _Pair, fits: images.PlaneFits, planes_c: NDArray[np.float64]) -> None:
+    kernels.pack_texture(pair.grey, level.texture)
+    kernels.pack_second_derivatives(level.texture)
+    fits.write(pair.depth, level.surface)
+    fits.adopt(planes_c, level.surface)
 
 
 def _sample_for(camera: Camera) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -16,6 +16,7 @@ from tgslam.stopwatch import Stopwatch
 from tgslam.tracking.exposure import Exposure
 from tgslam.tracking.first_order import FirstOrderTracker
 from tgslam.tracking.gauss_newton import GaussNewtonTracker
+from tgslam.tracking.reference import Reference
 from tgslam.tracking.result import TrackingResult
 from tgslam.types import Camera, Frame
 
@@ -26,8 +27,12 @@ class Tracker(Protocol):
     rasterizer: Rasterizer  # holds which Gaussians the last model image saw
     stopwatch: Stopwatch | None  # set it to have the stages timed, for benchmarks
 
-    def know_planes(self, planes_w: NDArray[np.float64]) -> None:
-        """The planes [P, 4] of the world that the camera is likely to see: n . x + d = 0, n towards where it is."""
+    def know(self, planes_w: NDArray[np.float64], references: Sequence[Reference]) -> None:
+        """What the next frames are likely to see.
+
+        planes_w: [P, 4] in the world: n . x + d = 0, n towards where the camera is. references: keyframes, the most
+        important first; no more of them than `TrackingConfig.references` are used.
+        """
         ...
 
     def track(
