@@ -66,12 +66,13 @@ def nearest_measured(depth_m: NDArray[np.float32]) -> NDArray[np.int64]:
     return pixels[regions]
 
 
-def filled(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+def filled(depth_m: NDArray[np.float32], focal_px: float) -> NDArray[np.float32]:
     """Guess the depth of holes: near measurements that of the nearest one, farther off a smooth mean of those around.
 
     Narrow holes lie at the edges of things. Whatever is there is one of the surfaces around; a mean of them would hang
     in the air between. Wide ones are mostly surfaces that return no light, and the mean continues them: it is of
-    inverse depth, in which planes are affine, interpolated from coarser and coarser means.
+    inverse depth, in which planes are affine, interpolated from coarser and coarser means. Where that is steeper than
+    what returns light, it leads from one surface to another, and one of them is taken as at edges.
 
     depth_m: [H, W], 0 = none. Measurements stay as they are; an image without any comes back as it is.
     """
@@ -79,9 +80,18 @@ def filled(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
     if valid.all() or not valid.any():
         return depth_m
     inverse = np.where(valid, 1.0 / np.where(valid, depth_m, 1.0), 0.0).astype(np.float32)
-    guess = 1.0 / np.maximum(_push_pull(inverse, valid.astype(np.float32)), 1e-3)
-    near = cv2.dilate(valid.astype(np.uint8), np.ones((2 * _NARROW_PX + 1, 2 * _NARROW_PX + 1), np.uint8)) > 0
-    return np.where(near, depth_m.ravel()[nearest_measured(depth_m)], guess).astype(np.float32)
+    mean = np.maximum(_push_pull(inverse, valid.astype(np.float32)), 1e-3)
+    edge = cv2.dilate(valid.astype(np.uint8), np.ones((2 * _NARROW_PX + 1, 2 * _NARROW_PX + 1), np.uint8)) > 0
+    edge |= _steep(mean, focal_px)
+    return np.where(edge, depth_m.ravel()[nearest_measured(depth_m)], 1.0 / mean).astype(np.float32)
+
+
+def _steep(inverse_depth: NDArray[np.float32], focal_px: float) -> NDArray[np.bool_]:
+    """[H, W] where an image of inverse depth, 1/m, is steeper than a surface that a sensor measures."""
+    down = cv2.Sobel(inverse_depth, -1, 0, 1, scale=0.125)
+    across = cv2.Sobel(inverse_depth, -1, 1, 0, scale=0.125)
+    steep: NDArray[np.bool_] = np.hypot(down, across) > _STEEPEST / focal_px * inverse_depth
+    return steep
 
 
 def _push_pull(value: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:

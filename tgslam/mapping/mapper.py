@@ -157,7 +157,7 @@ class Mapper:
         """Seed Gaussians where the map is open; where no depth was measured, at a guessed one."""
         measured_m = keyframe.depth_m()
         wanted = self._unexplained(keyframe, measured_m)
-        depth_m = filled(measured_m)
+        depth_m = filled(measured_m, self.camera.fx)
         colour = keyframe.exposure.gain * keyframe.colour() + np.float32(keyframe.exposure.bias)
         normals_c = runtime.to_host(
             images.normals(runtime.to_device(depth_m), self.camera, sigma_per_m2=self.loss.depth_sigma_per_m2)
@@ -246,7 +246,7 @@ class Mapper:
 
         What is beyond the sensor's range was put at its end; there it would hang before a camera that goes on.
         """
-        guess_m = filled(keyframe.depth_m())
+        guess_m = filled(keyframe.depth_m(), self.camera.fx)
         nearer = np.zeros(len(surface.z), bool)
         nearer[surface.inside] = surface.z[surface.inside] < _GUESS_SHARE * guess_m[surface.v, surface.u]
         return self.guessed & (surface.measured | nearer)
