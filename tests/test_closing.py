@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.plane_worlds import Box, odometry, position_errors_m, walking
-from tgslam.closures.closing import GraphClosing
+from tgslam.closures.closing import Correction, GraphClosing
 from tgslam.config.schema import ClosureConfig, Config, LoopConfig, PlanesConfig
 from tgslam.errors import ConfigError
 from tgslam.geometry import inverse, orthonormalized, se3_exp, se3_log
@@ -188,3 +188,23 @@ def test_refinement_and_planes_that_disagree_do_not_drive_graph_and_map_apart() 
         told, believed = tracked @ inverse(motion), closing._graph.estimate().T_cw[-1]
         np.testing.assert_allclose(believed, told, atol=1e-5)
         assert np.linalg.norm(se3_log(believed @ inverse(tracked))[:3]) < 0.005
+
+
+def test_closures_tie_keyframes_once_they_move_something() -> None:
+    slam = Slam(CAMERA, Config(loops=LoopConfig(enabled=True)))
+    linked: list[tuple[int, int]] = []
+    followed: list[dict] = []
+    slam.mapper = SimpleNamespace(
+        keyframes=[None] * 6,
+        planes=None,
+        viewpoints=SimpleNamespace(link=lambda *pair: linked.append(pair)),
+        follow=lambda motions: followed.append((motions, list(linked))),
+    )
+    corrections = iter([Correction({}, (0, 1)), Correction({}, ()), Correction({5: np.eye(4)}, (2,))])
+    slam.closing = SimpleNamespace(add=lambda keyframes, planes: next(corrections))
+    for _ in range(2):
+        slam._close()
+        assert not linked and not followed
+    slam._close()
+    assert linked == [(0, 5), (1, 5), (2, 5)]
+    assert len(followed) == 1 and followed[0][1] == linked  # the map follows with those ties

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -66,22 +68,59 @@ def nearest_measured(depth_m: NDArray[np.float32]) -> NDArray[np.int64]:
     return pixels[regions]
 
 
-def filled(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+@dataclass(frozen=True)
+class Guess:
+    """A depth image without holes."""
+
+    depth_m: NDArray[np.float32]  # [H, W]
+    source: NDArray[np.int64]  # [H, W] at steps the measured pixel behind them, in the flat image; -1 = elsewhere
+
+
+def filled(depth_m: NDArray[np.float32], focal_px: float) -> Guess:
     """Guess the depth of holes: near measurements that of the nearest one, farther off a smooth mean of those around.
 
     Narrow holes lie at the edges of things. Whatever is there is one of the surfaces around; a mean of them would hang
     in the air between. Wide ones are mostly surfaces that return no light, and the mean continues them: it is of
-    inverse depth, in which planes are affine, interpolated from coarser and coarser means.
+    inverse depth, in which planes are affine, interpolated from coarser and coarser means. Where that is steeper than
+    what returns light, it leads from one surface to another: a side too grazing for the sensor, or what the nearer one
+    hides from its light. How far that goes is not known, and the guess is the farther surface: nothing hangs before it.
 
     depth_m: [H, W], 0 = none. Measurements stay as they are; an image without any comes back as it is.
     """
     valid = depth_m > 0
+    source = np.full(depth_m.shape, -1, np.int64)
     if valid.all() or not valid.any():
-        return depth_m
+        return Guess(depth_m, source)
     inverse = np.where(valid, 1.0 / np.where(valid, depth_m, 1.0), 0.0).astype(np.float32)
-    guess = 1.0 / np.maximum(_push_pull(inverse, valid.astype(np.float32)), 1e-3)
-    near = cv2.dilate(valid.astype(np.uint8), np.ones((2 * _NARROW_PX + 1, 2 * _NARROW_PX + 1), np.uint8)) > 0
-    return np.where(near, depth_m.ravel()[nearest_measured(depth_m)], guess).astype(np.float32)
+    mean = np.maximum(_push_pull(inverse, valid.astype(np.float32)), 1e-3)
+    near = cv2.dilate(valid.astype(np.uint8), _square(_NARROW_PX)) > 0
+    guess_m = np.where(near, depth_m.ravel()[nearest_measured(depth_m)], 1.0 / mean)
+    step = ~near & _steep(mean, focal_px)
+    behind_m = np.where(valid & (inverse < _least_around(mean, step)), depth_m, np.float32(0.0))
+    if behind_m.any():
+        nearest = nearest_measured(behind_m)
+        source = np.where(step & (depth_m.ravel()[nearest] > guess_m), nearest, source)
+        guess_m = np.where(source >= 0, depth_m.ravel()[source], guess_m)
+    return Guess(guess_m.astype(np.float32), source)
+
+
+def _least_around(image: NDArray[np.float32], chosen: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """[H, W] the least of the chosen pixels just beyond a narrow hole's reach; 0 where there are none."""
+    least = cv2.erode(np.where(chosen, image, np.float32(np.inf)), _square(_NARROW_PX + 1), borderValue=np.inf)
+    return np.where(np.isfinite(least), least, np.float32(0.0))
+
+
+def _square(reach_px: int) -> NDArray[np.uint8]:
+    """What `cv2.dilate` looks at, as far as `reach_px` from a pixel."""
+    return np.ones((2 * reach_px + 1, 2 * reach_px + 1), np.uint8)
+
+
+def _steep(inverse_depth: NDArray[np.float32], focal_px: float) -> NDArray[np.bool_]:
+    """[H, W] where an image of inverse depth, 1/m, is steeper than a surface that a sensor measures."""
+    down = cv2.Sobel(inverse_depth, -1, 0, 1, scale=0.125)
+    across = cv2.Sobel(inverse_depth, -1, 1, 0, scale=0.125)
+    steep: NDArray[np.bool_] = np.hypot(down, across) > _STEEPEST / focal_px * inverse_depth
+    return steep
 
 
 def _push_pull(value: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:

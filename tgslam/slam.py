@@ -65,6 +65,7 @@ class Slam:
         self._posed: list[_Posed] = []
         self._stage_s: dict[str, float] = {}
         self._remarks: list[str] = []  # on the present frame
+        self._untied: list[tuple[int, int]] = []  # keyframes between which closures have moved nothing yet
 
     def process_frame(self, frame: Frame) -> FrameReport:
         """Estimate the frame's pose and, if it shows something new, map it. Frames come in order of time.
@@ -182,12 +183,21 @@ class Slam:
             return
         if correction.closures:
             self._remarks.append(f"closures with keyframes {', '.join(map(str, correction.closures))}")
-        for earlier in correction.closures:
-            self.mapper.viewpoints.link(earlier, latest)
+        self._untied += [(earlier, latest) for earlier in correction.closures]
         if correction.motions:
+            self._tie()
             with self._stage("follow"):
                 self.mapper.follow(correction.motions)
             self.motion.move(correction.motions[latest])
+
+    def _tie(self) -> None:
+        """Keyframes that closures tie are refined together once the map follows the graph: it may tear between them.
+
+        Before, closures have said nothing that the map does not, and leave it as it would be without them.
+        """
+        for first, second in self._untied:
+            self.mapper.viewpoints.link(first, second)
+        self._untied = []
 
     def _remember(self, frame: Frame, T_cw: NDArray[np.float64]) -> None:
         keyframe = self.mapper.keyframes[-1]

@@ -157,12 +157,14 @@ class Mapper:
         """Seed Gaussians where the map is open; where no depth was measured, at a guessed one."""
         measured_m = keyframe.depth_m()
         wanted = self._unexplained(keyframe, measured_m)
-        depth_m = filled(measured_m)
+        guess = filled(measured_m, self.camera.fx)
+        depth_m = guess.depth_m
         colour = keyframe.exposure.gain * keyframe.colour() + np.float32(keyframe.exposure.bias)
         normals_c = runtime.to_host(
             images.normals(runtime.to_device(depth_m), self.camera, sigma_per_m2=self.loss.depth_sigma_per_m2)
         )
         if planes:
+            planes = planes.continued(guess.source, self.camera.rays())
             depth_m = np.where((planes.depth_m > 0) & (measured_m <= 0), planes.depth_m, depth_m)
             normals_c = np.where(planes.depth_m[..., None] > 0, planes.normals_c, normals_c)
         ids = planes.ids if planes else None
@@ -246,7 +248,7 @@ class Mapper:
 
         What is beyond the sensor's range was put at its end; there it would hang before a camera that goes on.
         """
-        guess_m = filled(keyframe.depth_m())
+        guess_m = filled(keyframe.depth_m(), self.camera.fx).depth_m
         nearer = np.zeros(len(surface.z), bool)
         nearer[surface.inside] = surface.z[surface.inside] < _GUESS_SHARE * guess_m[surface.v, surface.u]
         return self.guessed & (surface.measured | nearer)
