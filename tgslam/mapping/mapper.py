@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 _MIN_COSINE = 0.1  # a surface more grazing than this says nothing of the depth beside
 _MAX_SLANT = 0.1  # nor one whose depth changes by more within a block
 _NOTICED_M = 0.005  # by which keyframes have moved against each other, for the map between them to be refined
+import os
+_FINAL_PACE = float(os.environ.get('FP','0.05'))
 _LAST_PACE = 0.3  # after a motion, steps get smaller down to this share
 _GUESS_SHARE = 0.8  # of a later guess of depth: an earlier one that is less is wrong
 _STEEPEST = 0.1  # deepest a Gaussian may be at the rim of the image, standard deviation over depth
@@ -126,9 +128,10 @@ class Mapper:
         """The final pass: every keyframe in turn, in random order, poses fixed."""
         if self.planes:
             self.planes.complete(self.keyframes)
-        for _ in range(0, self.config.final_iterations, max(len(self.keyframes), 1)):
-            for k in self.rng.permutation(len(self.keyframes)):
-                self.refiner.step(self.gaussians, self.keyframes[k], move_pose=False)
+        rounds = range(0, self.config.final_iterations, max(len(self.keyframes), 1))
+        views = [k for _ in rounds for k in self.rng.permutation(len(self.keyframes))]
+        for view, pace in zip(views, np.linspace(1.0, _FINAL_PACE, len(views)), strict=True):
+            self.refiner.step(self.gaussians, self.keyframes[view], move_pose=False, colour_pace=float(pace))
         self._prune()
 
     def _owners(self, surface: Surface) -> dict[int, float]:

@@ -77,7 +77,7 @@ class Refiner:
             self.structure.set_planes(planes)
 
     def step(
-        self, gaussians: GaussianMap, keyframe: Keyframe, *, move_pose: bool, pace: float = 1.0
+        self, gaussians: GaussianMap, keyframe: Keyframe, *, move_pose: bool, pace: float = 1.0, colour_pace: float = 1.0
     ) -> losses.LossResult:
         """Render the map at the keyframe, and move the map (and the keyframe's pose) downhill.
 
@@ -100,7 +100,7 @@ class Refiner:
         with stage(self.stopwatch, "backward"):
             g_pose = self._backward(gaussians, loss, pgi)
         with stage(self.stopwatch, "update"):
-            self._update_map(gaussians, loss, pgi, pace)
+            self._update_map(gaussians, loss, pgi, pace, pace * colour_pace)
             if move_pose:
                 self._update_pose(keyframe, g_pose)
         return loss
@@ -123,7 +123,7 @@ class Refiner:
         return self.rasterizer.backward(gaussians, g, self._gradient)
 
     def _update_map(
-        self, gaussians: GaussianMap, loss: losses.LossResult, pgi: InstanceGradient | None, pace: float
+        self, gaussians: GaussianMap, loss: losses.LossResult, pgi: InstanceGradient | None, pace: float, colour_pace: float
     ) -> None:
         gradient, visible = self._gradient, self.rasterizer.tile_count
         if self.structure:
@@ -141,7 +141,7 @@ class Refiner:
         if self.config.optimizer == "relaxation":
             relaxation.relax(
                 gaussians.count, visible, gradient.colour, gradient.curvature, loss.totals,
-                pace * self.config.relaxation, weight, gaussians.colour,
+                colour_pace * self.config.relaxation, weight, gaussians.colour,
             )  # fmt: skip
         self._sightings.record(visible, gradient.curvature, loss.totals, weight)
 
