@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,7 +15,8 @@ from tgslam.mapping.planar import PlanarMapping
 from tgslam.plane_fit import CellGrid
 from tgslam.planes.cells import planar_cells
 from tgslam.planes.extraction import extract_planes
-from tgslam.planes.layers import bordering, settle
+from tgslam.planes.layers import bordering, part_layers, settle
+from tgslam.planes.merging import Agreement
 from tgslam.planes.registry import PlaneRegistry
 from tgslam.planes.segment import PlaneView
 from tgslam.types import Camera
@@ -37,6 +39,14 @@ def seen(depth_m: np.ndarray) -> PlaneView:
     return extract_planes(runtime.to_device(depth_m), CAMERA, CONFIG, DEPTH_SIGMA_PER_M2)
 
 
+def rolled(T_cw: np.ndarray, roll_deg: float) -> np.ndarray:
+    """The camera, turned about its line of sight."""
+    c, s = np.cos(np.radians(roll_deg)), np.sin(np.radians(roll_deg))
+    turn = np.eye(4)
+    turn[:2, :2] = [[c, -s], [s, c]]
+    return np.asarray(turn @ T_cw)
+
+
 def of_board(view: PlaneView, labels: np.ndarray) -> int:
     """The segment that most of the board's pixels belong to."""
     return int(np.argmax(np.bincount(view.labels[labels == 1] + 1)) - 1)
@@ -55,6 +65,62 @@ def test_a_board_on_a_wall_is_a_segment_of_its_own_and_parallel_to_it(seed: int)
     assert segment.normal_c @ wall.normal_c == pytest.approx(1.0, abs=1e-9)
     assert wall.offset_m - segment.offset_m == pytest.approx(0.015, abs=0.004)
     np.testing.assert_allclose(segment.covariance[:2, :2], wall.covariance[:2, :2])
+
+
+FAR_WALL = Rectangle((0.0, 3.7, 1.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (8.0, 4.0))
+FAR_BOARD = Rectangle((0.0, 3.68, 0.6), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (3.0, 0.08))
+
+
+def measured_alike(rectangles: list[Rectangle], T_cw: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """As `measured`, where neighbouring pixels err alike: as if a sixth of them were measured."""
+    depth_m, labels = cast(rectangles, CAMERA, T_cw)
+    white = np.random.default_rng(seed).standard_normal(depth_m.shape)
+    kernel = cv2.getGaussianKernel(5, 0.7)
+    noise = cv2.sepFilter2D(white, -1, kernel, kernel) / np.sum(kernel**2)
+    return np.where(depth_m > 0, depth_m + DEPTH_SIGMA_PER_M2 * depth_m**2 * noise, 0.0).astype(np.float32), labels
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("roll_deg", [0.0, 30.0])
+def test_a_strip_that_no_cell_tells_from_the_wall_is_found_along_it_and_kept(seed: int, roll_deg: float) -> None:
+    T_cw = rolled(looking((0.0, 0.0, 1.2), (0.0, 3.7, 0.8)), roll_deg)
+    depth_m, labels = measured_alike([FAR_WALL, FAR_BOARD], T_cw, seed)
+    grid = CellGrid(CAMERA, 4)
+    graph = planar_cells(runtime.to_device(depth_m), grid, DEPTH_SIGMA_PER_M2, CONFIG.cell_share, CONFIG.cell_sigmas)
+    board = labels.reshape(60, 4, 80, 4).mean(axis=(1, 3)).ravel()[graph.cell]
+    agreement = Agreement(DEPTH_SIGMA_PER_M2, CONFIG.join_sigmas, 0.0, CONFIG.join_shift_m)
+    group, parent = part_layers(graph, grid.shape, np.zeros(len(board), np.intp), agreement, least_px=230.0)
+    strip = np.isin(group, np.flatnonzero(parent == 0))
+    assert np.mean(board[strip] > 0.1) > 0.6
+    assert np.mean(strip[board > 0.9]) > 0.4
+    kept = settle(graph, grid.shape, group, 5000.0, parent)
+    wall = np.bincount(kept[board == 0]).argmax()
+    assert np.mean(kept[strip & (board > 0.9)] != wall) == 1.0
+    lost = settle(graph, grid.shape, group, 5000.0)
+    assert np.mean(lost[strip & (board > 0.9)] == np.bincount(lost[board == 0]).argmax()) > 0.2
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_far_wall_without_a_board_is_one_surface(seed: int) -> None:
+    depth_m, _ = measured_alike([FAR_WALL], looking((0.0, 0.0, 1.2), (0.3, 3.7, 0.8)), seed)
+    view = seen(depth_m)
+    assert len(view.segments) == 1
+    assert not view.steps
+
+
+def test_a_narrow_surface_is_not_turned_by_the_edge_beside_it() -> None:
+    # The side of a shelf, at a grazing angle, and the front of the same board
+    side = Rectangle((0.0, 3.15, 1.2), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.3, 2.0))
+    edge = Rectangle((0.0125, 3.0, 1.2), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.025, 2.0))
+    T_cw = looking((-0.75, 0.0, 1.2), (0.0, 3.0, 1.2))
+    errors_deg = []
+    for seed in range(6):
+        depth_m, labels = measured_alike([side, edge], T_cw, seed)
+        view = seen(depth_m)
+        found = int(np.argmax(np.bincount(view.labels[labels == 0] + 1)[1:]))
+        cosine = abs(view.segments[found].normal_c @ T_cw[:3, 0])
+        errors_deg.append(np.degrees(np.arccos(min(cosine, 1.0))))
+    assert np.mean(errors_deg) < 1.0, errors_deg
 
 
 @pytest.mark.parametrize("wave_m", [0.0, 0.004])
