@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.plane_views import DEPTH_SIGMA_PER_M2, Rectangle, cast, looking
+from tests.plane_views import DEPTH_SIGMA_PER_M2, Rectangle, cast, looking, points_c, segment_of
 from tgslam import runtime
 from tgslam.config.schema import PlanesConfig
 from tgslam.mapping.planar import PlanarMapping
@@ -247,3 +247,26 @@ def test_a_boards_extent_is_not_worn_away_by_the_wall_beside_it() -> None:
     places = np.array(in_view.centre) + np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
     assert np.mean(board.support.holds(board.support.cells_of(places))) > 0.95
     assert np.mean(wall.support.holds(wall.support.cells_of(places))) < 0.3
+
+
+def labelled(depth_m: np.ndarray, labels: np.ndarray, planes_c: list[np.ndarray]) -> PlaneView:
+    """What a segmenter shows whose segments are these labels [H, W], with these planes [4] in the camera's frame."""
+    rng, points = np.random.default_rng(0), points_c(CAMERA, depth_m)
+    area_m2 = depth_m**2 / CAMERA.fx**2
+    segments = [segment_of(points[labels == k], plane, area_m2[labels == k], rng) for k, plane in enumerate(planes_c)]
+    return PlaneView(labels.astype(np.int32), tuple(segments))
+
+
+def test_a_piece_of_a_surface_is_not_taken_for_a_smaller_one_before_it_that_the_view_does_not_show() -> None:
+    patch = Rectangle((0.35, 1.975, 1.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.4, 0.3))
+    T_cw = looking((0.0, 0.0, 1.0), (0.0, 2.0, 1.0))
+    depth_m, labels = cast([WALL, patch], CAMERA, T_cw)
+    wall, front, between = (np.array([0.0, 0.0, -1.0, z]) for z in (2.0, 1.975, 1.985))
+    registry = PlaneRegistry(CONFIG, DEPTH_SIGMA_PER_M2)
+    first = registry.observe(labelled(depth_m, labels, [wall, front]), depth_m, CAMERA, T_cw, 0)
+    halves = np.zeros_like(labels)
+    halves[:, 150:] = -1
+    halves[70:170, 170:280] = 1
+    second = registry.observe(labelled(depth_m, halves, [wall, between]), depth_m, CAMERA, T_cw, 1)
+    assert second.ids.tolist() == [first.ids[0], first.ids[0]]
+    assert registry.instances[int(first.ids[1])].keyframes == [0]

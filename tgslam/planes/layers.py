@@ -46,7 +46,7 @@ def part_layers(
     group, moments = group.copy(), group_moments(graph, group)
     misfit = _misfits(graph, planes_of(moments)[group])
     parents: dict[int, int] = {}
-    for find in (_strips, _standing_off):
+    for find in (_standing_off, _strips):
         for index in np.flatnonzero(moments[:, 0] > 2 * least_px):
             nodes = np.flatnonzero(group == index)
             for part in find(misfit[nodes], graph.cell[nodes], shape, graph.moments[nodes, 0], least_px):
