@@ -208,6 +208,19 @@ def test_keyframes_before_a_plane_was_confirmed_show_it_too() -> None:
     assert np.mean(keyframes[0].plane_ids[masks[0]] == board) > 0.6
 
 
+def test_a_surface_that_waits_for_other_views_is_no_part_of_the_floor_that_it_stands_on() -> None:
+    floor = Rectangle((0.0, 0.0, 0.56), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (6.0, 4.0))
+    mapping, keyframes = PlanarMapping(CAMERA, CONFIG, DEPTH_SIGMA_PER_M2), []
+    for index, T_cw in enumerate(ALONG[:2]):
+        depth_m, labels = measured([WALL, BOARD, floor], T_cw, index)
+        keyframes.append(SimpleNamespace(T_cw=T_cw, depth_m=lambda depth_m=depth_m: depth_m, plane_ids=None))
+        mapping.observe(keyframes)
+        view = seen(depth_m)
+        waiting = view.labels == of_board(view, labels)
+        assert waiting.sum() > 500
+        assert (keyframes[-1].plane_ids[waiting] == -1).all()
+
+
 def test_keyframes_show_in_the_end_what_only_later_ones_have_seen_of_a_plane() -> None:
     mapping, keyframes = PlanarMapping(CAMERA, CONFIG, DEPTH_SIGMA_PER_M2), []
     speck = np.zeros((CAMERA.height, CAMERA.width), bool)
