@@ -16,6 +16,7 @@ from tgslam.planes.sight import Gap, Samples, Tolerance, gap_between
 
 _MOST = 0.5
 _TAKEN_SHARE = 0.8  # of what a view shows of a surface, that it counts to another one
+_FILLED_SHARE = 0.25  # of the views of a gap, in which something stands in it: in so few, it parts nothing
 _BEHIND_SHARE = 0.02  # of all surfaces, that errors may put behind a plane that bounds the scene
 
 Pair = tuple[PlanarInstance, PlanarInstance]
@@ -31,10 +32,13 @@ class Joining:
         self._apart: dict[frozenset[PlanarInstance], None] = {}
         # Those of them of which one stands a little before the other
         self._steps: dict[frozenset[PlanarInstance], None] = {}
+        # Those of them that only what stands in the gap parts: by keyframe that shows the gap, whether it is filled
+        self._filled: dict[frozenset[PlanarInstance], dict[int, bool]] = {}
 
     def part(self, a: PlanarInstance, b: PlanarInstance) -> None:
-        """A gap parts two instances in a view."""
+        """A gap parts two instances in a view, for good."""
         self._apart[frozenset((a, b))] = None
+        self._filled.pop(frozenset((a, b)), None)
 
     def step(self, a: PlanarInstance, b: PlanarInstance) -> None:
         """A step parts two instances in a view."""
@@ -51,10 +55,12 @@ class Joining:
 
     def replace(self, absorbed: PlanarInstance, kept: PlanarInstance) -> None:
         """What parts one instance from others parts the one that has absorbed it from them."""
-        self._apart, self._steps = (
-            {pair: None for known in pairs if len(pair := frozenset(kept if i is absorbed else i for i in known)) == 2}
-            for pairs in (self._apart, self._steps)
-        )
+        renamed = {pair: frozenset(kept if i is absorbed else i for i in pair) for pair in self._apart}
+        sure = {renamed[pair] for pair in self._apart if pair not in self._filled}
+        filled = {renamed[pair]: looks for pair, looks in self._filled.items() if renamed[pair] not in sure}
+        self._apart = {pair: None for pair in renamed.values() if len(pair) == 2}
+        self._steps = {renamed[pair]: None for pair in self._steps if renamed[pair] in self._apart}
+        self._filled = {pair: looks for pair, looks in filled.items() if pair in self._apart}
 
     def twins(
         self, touched: Sequence[PlanarInstance], everything: Sequence[PlanarInstance], samples: Samples | None
@@ -97,7 +103,7 @@ class Joining:
 
         Floors, walls and ceilings go on behind things and where no view has looked, those that bound the scene however
         far; table tops are smaller. A gap that has parted two in any view does so for good but where large ones touch,
-        as walls do over a door.
+        as walls do over a door, or where most views show that nothing stands in it.
         """
         large, cells = _on_larger(a, b)
         longest_m = np.inf if bounding else self._config.bridge_m
@@ -105,8 +111,8 @@ class Joining:
         gap = Gap(False, False, False)
         if ways is not None and samples is not None:
             gap = gap_between(samples, *ways, large.plane, self._tolerance)
+        self._look(a, b, gap)
         if gap.parts(max(a.area_m2, b.area_m2), self._config):
-            self.part(a, b)
             return False
         if frozenset((a, b)) in self._apart:
             touching = adjoins(large.support.near(cells, 0.0))
@@ -116,6 +122,25 @@ class Joining:
         if ways is None or samples is None:
             return False
         return gap.hidden or min(a.area_m2, b.area_m2) >= self._config.bridge_area_m2
+
+    def _look(self, a: PlanarInstance, b: PlanarInstance, gap: Gap) -> None:
+        """Remember whether a gap parts two instances in the latest view.
+
+        What is seen through it does for good. What stands in it hides which they are: it parts them as long as it is
+        there in view after view, and not in a few of many, as noise is.
+        """
+        pair, keyframe = frozenset((a, b)), max(a.keyframes[-1], b.keyframes[-1])
+        filled = not gap.open and gap.parts(max(a.area_m2, b.area_m2), self._config)
+        if gap.open:
+            self.part(a, b)
+        elif filled and pair not in self._apart:
+            self._apart[pair], self._filled[pair] = None, {keyframe: True}
+        elif pair in self._filled and (filled or gap.hidden):
+            looks = self._filled[pair]
+            looks[keyframe] = filled
+            if sum(looks.values()) <= _FILLED_SHARE * len(looks):
+                del self._apart[pair], self._filled[pair]
+                a.seen_past = b.seen_past = True
 
     def _bounds(self, a: PlanarInstance, b: PlanarInstance, everything: Sequence[PlanarInstance]) -> bool:
         """Whether a pair, one of it large, has everything in front of it: floors, walls and ceilings have, which is
