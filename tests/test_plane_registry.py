@@ -214,7 +214,7 @@ def test_a_board_parts_small_fronts_only(size: tuple[float, float], surfaces: in
 
 
 @pytest.mark.parametrize(("often", "surfaces"), [(4, 1), (2, 2)])
-def test_what_few_views_show_in_a_gap_parts_nothing(often: int, surfaces: int) -> None:
+def test_what_most_views_do_not_show_in_a_gap_parts_nothing(often: int, surfaces: int) -> None:
     """Something fills the gap in each `often`th view, and a rail far before it hides it in the others."""
     fronts = [Rectangle((0.0, 2.8, 1.2 + z), (1, 0, 0), (0, 0, 1), (0.8, 0.3)) for z in (-0.17, 0.17)]
     board = Rectangle((0.0, 2.75, 1.2), (1, 0, 0), (0, 0, 1), (3.0, 0.06))

@@ -16,7 +16,6 @@ from tgslam.planes.sight import Gap, Samples, Tolerance, gap_between
 
 _MOST = 0.5
 _TAKEN_SHARE = 0.8  # of what a view shows of a surface, that it counts to another one
-_FILLED_SHARE = 0.25  # of the views of a gap, in which something stands in it: in so few, it parts nothing
 _BEHIND_SHARE = 0.02  # of all surfaces, that errors may put behind a plane that bounds the scene
 
 Pair = tuple[PlanarInstance, PlanarInstance]
@@ -126,8 +125,8 @@ class Joining:
     def _look(self, a: PlanarInstance, b: PlanarInstance, gap: Gap) -> None:
         """Remember whether a gap parts two instances in the latest view.
 
-        What is seen through it does for good. What stands in it hides which they are: it parts them as long as it is
-        there in view after view, and not in a few of many, as noise is.
+        What is seen through it does for good. What stands in it hides which they are: it parts them as long as half
+        of the views or more show it: in fewer, it is noise.
         """
         pair, keyframe = frozenset((a, b)), max(a.keyframes[-1], b.keyframes[-1])
         filled = not gap.open and gap.parts(max(a.area_m2, b.area_m2), self._config)
@@ -138,7 +137,7 @@ class Joining:
         elif pair in self._filled and (filled or gap.hidden):
             looks = self._filled[pair]
             looks[keyframe] = filled
-            if sum(looks.values()) <= _FILLED_SHARE * len(looks):
+            if len(looks) >= self._config.confirm_views and 2 * sum(looks.values()) < len(looks):
                 del self._apart[pair], self._filled[pair]
                 a.seen_past = b.seen_past = True
 
