@@ -254,6 +254,20 @@ def test_a_bent_piece_becomes_part_of_the_surface_to_which_views_count_it() -> N
     assert_allclose(stage.registry.instances[wall].normal_w, [0, -1, 0], atol=0.005)
 
 
+def test_a_bent_piece_is_not_kept_by_a_sliver_of_it_that_views_show_again() -> None:
+    bend = np.deg2rad(7.0)
+    bent = Rectangle((1.2, 2.97, 1.2), (np.cos(bend), np.sin(bend), 0), (0, 0, 1), (0.6, 1.2))
+    stage = Stage([WALL, FLOOR, replace(bent, size=(0.11, 1.2))])
+    _, ids = stage.show(HERE, rectangles=[WALL, FLOOR, bent])
+    scrap, wall = ids[2][0], ids[0][0]
+    for x in (0.0, 0.1):
+        seen, ids = stage.show(looking((x, 0.0, 1.4), (0.9, 3.0, 1.0)))
+        assert ids[2] == [scrap]
+        assert seen.merged == ()
+    seen, _ = stage.show(looking((0.2, 0.0, 1.4), (0.9, 3.0, 1.0)), rectangles=[WALL, FLOOR])
+    assert seen.merged == ((wall, scrap),)
+
+
 def test_a_wall_that_something_hides_in_part_is_one() -> None:
     pillar = Rectangle((0.0, 2.0, 1.25), (1, 0, 0), (0, 0, 1), (0.3, 2.5))
     _, ids = Stage([WALL, pillar, FLOOR]).show(HERE)

@@ -101,7 +101,7 @@ class PlanarInstance:
             np.array([rms_m]),
         )
         self.keyframes = sorted({*self.keyframes, keyframe})
-        self.unseen = self.through = self.taken = 0
+        self.unseen = self.through = 0
         self.refit(poses)
 
     def absorb(self, other: PlanarInstance, poses: Poses) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,20 +157,22 @@ class Joining:
                 other_m2 += other.area_m2
         return other_m2 >= least_m2 and behind_m2 <= _BEHIND_SHARE * other_m2
 
-    def overruled(self, matching: ViewMatching, seen: Collection[PlanarInstance]) -> list[Pair]:
-        """(larger, smaller) instances where view after view counts to the larger one all that it shows of the smaller.
+    def overruled(self, matching: ViewMatching) -> list[Pair]:
+        """(larger, smaller) instances where view after view counts to the larger one most that it shows of the smaller.
 
         Then the smaller one was a part of the larger one that a view at a bad angle or from afar has bent.
         """
         found = []
         for index, view in matching.sights.items():
             instance = matching.instances[index]
-            if instance in seen or len(view.shown) < LEAST_SAMPLES:
+            if len(view.shown) < LEAST_SAMPLES:
                 continue
             owner = self._taker(matching, view.shown)
-            instance.taken = instance.taken + 1 if owner is not None and owner is instance.taken_by else 1
+            instance.taken = instance.taken + 1 if owner is instance.taken_by else 1
             instance.taken_by = owner
-            if owner is not None and instance.taken >= self._config.through_keyframes and self._covers(owner, instance):
+            if owner is None or owner is instance:
+                continue
+            if instance.taken >= self._config.through_keyframes and self._covers(owner, instance):
                 found.append((owner, instance))
         return found
 
