@@ -14,6 +14,7 @@ RAW_COUNT, RAW_SQUARES = MOMENTS, MOMENTS + 1  # after the weighted moments: pix
 SEGMENT_SUMS = MOMENTS + 2
 _WINDOW = 2  # px, of the square that decides between planes that both fit: 5 x 5 pixels
 _MIN_ALIKE = 3  # of 8 neighbours
+_RIM_WEIGHT = 0.1  # of pixels beside those of other labels: what borders a surface often lies within its tolerance
 
 nd = ti.types.ndarray
 
@@ -166,6 +167,17 @@ def label_pixels(
                 labels[v, u] = label
 
 
+@ti.func
+def alike(labels: ti.template(), v, u):
+    """How many of the 8 pixels around one share its label; those beyond the image are as the nearest ones in it."""
+    label, count = labels[v, u], -1  # itself
+    for r in ti.static(range(-1, 2)):
+        for q in ti.static(range(-1, 2)):
+            y, x = ti.min(ti.max(v + r, 0), labels.shape[0] - 1), ti.min(ti.max(u + q, 0), labels.shape[1] - 1)
+            count += ti.select(labels[y, x] == label, 1, 0)
+    return count
+
+
 @ti.kernel
 def drop_lonely(
     labels: nd(ti.i32, ndim=2),  # [H, W] -1 = none
@@ -177,13 +189,7 @@ def drop_lonely(
     for s in range(height * columns):
         v, part = s // columns, s % columns
         for u in range(part * width // columns, (part + 1) * width // columns):
-            label = labels[v, u]
-            alike = -1  # itself
-            for r in ti.static(range(-1, 2)):
-                for q in ti.static(range(-1, 2)):
-                    y, x = ti.min(ti.max(v + r, 0), height - 1), ti.min(ti.max(u + q, 0), width - 1)
-                    alike += ti.select(labels[y, x] == label, 1, 0)
-            kept[v, u] = ti.select(alike >= _MIN_ALIKE, label, -1)
+            kept[v, u] = ti.select(alike(labels, v, u) >= _MIN_ALIKE, labels[v, u], -1)
 
 
 @ti.kernel
@@ -199,7 +205,10 @@ def segment_sums(
     scale: ti.f32,  # Charbonnier's epsilon, 1/m
     sums: nd(ti.f32, ndim=3),  # [C, 4, 12] out; x and y in px from the cell's centre, w is the misfit
 ):
-    """Moments of the misfits of each candidate's pixels in each cell, weighted by 1 / sqrt(1 + (misfit / scale)^2)."""
+    """Moments of the misfits of each candidate's pixels in each cell, weighted by 1 / sqrt(1 + (misfit / scale)^2).
+
+    Pixels at the rim of a segment weigh less: they may show what is beside it, and turn narrow segments most.
+    """
     for c in range(found.shape[0]):
         top, bottom, left, right, x0, y0 = extent(c, cell, columns, depth.shape[0], depth.shape[1])
         for m in range(CANDIDATES):
@@ -212,6 +221,7 @@ def segment_sums(
                         if labels[v, u] == k:
                             x, r = u - x0, misfit(depth, planes, k, u, v, cx, cy)
                             q = 1.0 / ti.sqrt(1.0 + (r / scale) * (r / scale))
+                            q *= ti.select(alike(labels, v, u) < 8, _RIM_WEIGHT, 1.0)
                             total += ti.Vector(
                                 [q, q * x, q * y, q * x * x, q * x * y, q * y * y, q * r, q * x * r, q * y * r,
                                  q * r * r, 1.0, r * r]

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
-from tests.plane_views import DEPTH_SIGMA_PER_M2, Rectangle, cast, looking
+from tests.plane_views import DEPTH_SIGMA_PER_M2, Rectangle, cast, looking, points_c, segment_of
 from tgslam import runtime
 from tgslam.config.schema import PlanesConfig
 from tgslam.mapping.planar import PlanarMapping
 from tgslam.plane_fit import CellGrid
 from tgslam.planes.cells import planar_cells
 from tgslam.planes.extraction import extract_planes
-from tgslam.planes.layers import bordering, settle
+from tgslam.planes.layers import bordering, part_layers, settle
+from tgslam.planes.merging import Agreement
 from tgslam.planes.registry import PlaneRegistry
 from tgslam.planes.segment import PlaneView
 from tgslam.types import Camera
@@ -37,6 +39,14 @@ def seen(depth_m: np.ndarray) -> PlaneView:
     return extract_planes(runtime.to_device(depth_m), CAMERA, CONFIG, DEPTH_SIGMA_PER_M2)
 
 
+def rolled(T_cw: np.ndarray, roll_deg: float) -> np.ndarray:
+    """The camera, turned about its line of sight."""
+    c, s = np.cos(np.radians(roll_deg)), np.sin(np.radians(roll_deg))
+    turn = np.eye(4)
+    turn[:2, :2] = [[c, -s], [s, c]]
+    return np.asarray(turn @ T_cw)
+
+
 def of_board(view: PlaneView, labels: np.ndarray) -> int:
     """The segment that most of the board's pixels belong to."""
     return int(np.argmax(np.bincount(view.labels[labels == 1] + 1)) - 1)
@@ -55,6 +65,62 @@ def test_a_board_on_a_wall_is_a_segment_of_its_own_and_parallel_to_it(seed: int)
     assert segment.normal_c @ wall.normal_c == pytest.approx(1.0, abs=1e-9)
     assert wall.offset_m - segment.offset_m == pytest.approx(0.015, abs=0.004)
     np.testing.assert_allclose(segment.covariance[:2, :2], wall.covariance[:2, :2])
+
+
+FAR_WALL = Rectangle((0.0, 3.7, 1.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (8.0, 4.0))
+FAR_BOARD = Rectangle((0.0, 3.68, 0.6), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (3.0, 0.08))
+
+
+def measured_alike(rectangles: list[Rectangle], T_cw: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """As `measured`, where neighbouring pixels err alike: as if a sixth of them were measured."""
+    depth_m, labels = cast(rectangles, CAMERA, T_cw)
+    white = np.random.default_rng(seed).standard_normal(depth_m.shape)
+    kernel = cv2.getGaussianKernel(5, 0.7)
+    noise = cv2.sepFilter2D(white, -1, kernel, kernel) / np.sum(kernel**2)
+    return np.where(depth_m > 0, depth_m + DEPTH_SIGMA_PER_M2 * depth_m**2 * noise, 0.0).astype(np.float32), labels
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("roll_deg", [0.0, 30.0])
+def test_a_strip_that_no_cell_tells_from_the_wall_is_found_along_it_and_kept(seed: int, roll_deg: float) -> None:
+    T_cw = rolled(looking((0.0, 0.0, 1.2), (0.0, 3.7, 0.8)), roll_deg)
+    depth_m, labels = measured_alike([FAR_WALL, FAR_BOARD], T_cw, seed)
+    grid = CellGrid(CAMERA, 4)
+    graph = planar_cells(runtime.to_device(depth_m), grid, DEPTH_SIGMA_PER_M2, CONFIG.cell_share, CONFIG.cell_sigmas)
+    board = labels.reshape(60, 4, 80, 4).mean(axis=(1, 3)).ravel()[graph.cell]
+    agreement = Agreement(DEPTH_SIGMA_PER_M2, CONFIG.join_sigmas, 0.0, CONFIG.join_shift_m)
+    group, parent = part_layers(graph, grid.shape, np.zeros(len(board), np.intp), agreement, least_px=230.0)
+    strip = np.isin(group, np.flatnonzero(parent == 0))
+    assert np.mean(board[strip] > 0.1) > 0.6
+    assert np.mean(strip[board > 0.9]) > 0.4
+    kept = settle(graph, grid.shape, group, 5000.0, parent)
+    wall = np.bincount(kept[board == 0]).argmax()
+    assert np.mean(kept[strip & (board > 0.9)] != wall) == 1.0
+    lost = settle(graph, grid.shape, group, 5000.0)
+    assert np.mean(lost[strip & (board > 0.9)] == np.bincount(lost[board == 0]).argmax()) > 0.2
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_far_wall_without_a_board_is_one_surface(seed: int) -> None:
+    depth_m, _ = measured_alike([FAR_WALL], looking((0.0, 0.0, 1.2), (0.3, 3.7, 0.8)), seed)
+    view = seen(depth_m)
+    assert len(view.segments) == 1
+    assert not view.steps
+
+
+def test_a_narrow_surface_is_not_turned_by_the_edge_beside_it() -> None:
+    # The side of a shelf, at a grazing angle, and the front of the same board
+    side = Rectangle((0.0, 3.15, 1.2), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.3, 2.0))
+    edge = Rectangle((0.0125, 3.0, 1.2), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.025, 2.0))
+    T_cw = looking((-0.75, 0.0, 1.2), (0.0, 3.0, 1.2))
+    errors_deg = []
+    for seed in range(6):
+        depth_m, labels = measured_alike([side, edge], T_cw, seed)
+        view = seen(depth_m)
+        found = int(np.argmax(np.bincount(view.labels[labels == 0] + 1)[1:]))
+        cosine = abs(view.segments[found].normal_c @ T_cw[:3, 0])
+        errors_deg.append(np.degrees(np.arccos(min(cosine, 1.0))))
+    assert np.mean(errors_deg) < 1.0, errors_deg
 
 
 @pytest.mark.parametrize("wave_m", [0.0, 0.004])
@@ -142,6 +208,19 @@ def test_keyframes_before_a_plane_was_confirmed_show_it_too() -> None:
     assert np.mean(keyframes[0].plane_ids[masks[0]] == board) > 0.6
 
 
+def test_a_surface_that_waits_for_other_views_is_no_part_of_the_floor_that_it_stands_on() -> None:
+    floor = Rectangle((0.0, 0.0, 0.56), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (6.0, 4.0))
+    mapping, keyframes = PlanarMapping(CAMERA, CONFIG, DEPTH_SIGMA_PER_M2), []
+    for index, T_cw in enumerate(ALONG[:2]):
+        depth_m, labels = measured([WALL, BOARD, floor], T_cw, index)
+        keyframes.append(SimpleNamespace(T_cw=T_cw, depth_m=lambda depth_m=depth_m: depth_m, plane_ids=None))
+        mapping.observe(keyframes)
+        view = seen(depth_m)
+        waiting = view.labels == of_board(view, labels)
+        assert waiting.sum() > 500
+        assert (keyframes[-1].plane_ids[waiting] == -1).all()
+
+
 def test_keyframes_show_in_the_end_what_only_later_ones_have_seen_of_a_plane() -> None:
     mapping, keyframes = PlanarMapping(CAMERA, CONFIG, DEPTH_SIGMA_PER_M2), []
     speck = np.zeros((CAMERA.height, CAMERA.width), bool)
@@ -181,3 +260,26 @@ def test_a_boards_extent_is_not_worn_away_by_the_wall_beside_it() -> None:
     places = np.array(in_view.centre) + np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
     assert np.mean(board.support.holds(board.support.cells_of(places))) > 0.95
     assert np.mean(wall.support.holds(wall.support.cells_of(places))) < 0.3
+
+
+def labelled(depth_m: np.ndarray, labels: np.ndarray, planes_c: list[np.ndarray]) -> PlaneView:
+    """What a segmenter shows whose segments are these labels [H, W], with these planes [4] in the camera's frame."""
+    rng, points = np.random.default_rng(0), points_c(CAMERA, depth_m)
+    area_m2 = depth_m**2 / CAMERA.fx**2
+    segments = [segment_of(points[labels == k], plane, area_m2[labels == k], rng) for k, plane in enumerate(planes_c)]
+    return PlaneView(labels.astype(np.int32), tuple(segments))
+
+
+def test_a_piece_of_a_surface_is_not_taken_for_a_smaller_one_before_it_that_the_view_does_not_show() -> None:
+    patch = Rectangle((0.35, 1.975, 1.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.4, 0.3))
+    T_cw = looking((0.0, 0.0, 1.0), (0.0, 2.0, 1.0))
+    depth_m, labels = cast([WALL, patch], CAMERA, T_cw)
+    wall, front, between = (np.array([0.0, 0.0, -1.0, z]) for z in (2.0, 1.975, 1.985))
+    registry = PlaneRegistry(CONFIG, DEPTH_SIGMA_PER_M2)
+    first = registry.observe(labelled(depth_m, labels, [wall, front]), depth_m, CAMERA, T_cw, 0)
+    halves = np.zeros_like(labels)
+    halves[:, 150:] = -1
+    halves[70:170, 170:280] = 1
+    second = registry.observe(labelled(depth_m, halves, [wall, between]), depth_m, CAMERA, T_cw, 1)
+    assert second.ids.tolist() == [first.ids[0], first.ids[0]]
+    assert registry.instances[int(first.ids[1])].keyframes == [0]

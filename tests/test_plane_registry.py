@@ -213,6 +213,20 @@ def test_a_board_parts_small_fronts_only(size: tuple[float, float], surfaces: in
     assert len({ids[0][0], ids[1][0]}) == surfaces
 
 
+@pytest.mark.parametrize(("often", "surfaces"), [(4, 1), (2, 2)])
+def test_what_most_views_do_not_show_in_a_gap_parts_nothing(often: int, surfaces: int) -> None:
+    """Something fills the gap in each `often`th view, and a rail far before it hides it in the others."""
+    fronts = [Rectangle((0.0, 2.8, 1.2 + z), (1, 0, 0), (0, 0, 1), (0.8, 0.3)) for z in (-0.17, 0.17)]
+    board = Rectangle((0.0, 2.75, 1.2), (1, 0, 0), (0, 0, 1), (3.0, 0.06))
+    rail = Rectangle((0.0, 2.3, 1.21), (1, 0, 0), (0, 0, 1), (3.0, 0.06))
+    stage = Stage([*fronts, WALL])
+    for view, x in enumerate(np.linspace(-0.3, 0.3, 13)):
+        before = rail if view % often else board
+        _, ids = stage.show(looking((float(x), 0.9, 1.25), (0.0, 3.0, 1.2)), rectangles=[*fronts, WALL, before])
+    assert len({*ids[0], *ids[1]}) == surfaces
+    assert len({stage.registry.resolve(found[0]) for found in (ids[0], ids[1])}) == surfaces
+
+
 def test_what_was_taken_for_one_surface_is_parted_when_views_look_through_it() -> None:
     stage = Stage([*ROWS, WALL, FLOOR])
     both = Rectangle((0.0, 2.8, 1.1), (1, 0, 0), (0, 0, 1), (0.8, 0.7))
@@ -238,6 +252,20 @@ def test_a_bent_piece_becomes_part_of_the_surface_to_which_views_count_it() -> N
     assert merged[0] == merged[1] == ()  # not at the first view
     assert stage.registry.resolve(scrap) == wall
     assert_allclose(stage.registry.instances[wall].normal_w, [0, -1, 0], atol=0.005)
+
+
+def test_a_bent_piece_is_not_kept_by_a_sliver_of_it_that_views_show_again() -> None:
+    bend = np.deg2rad(7.0)
+    bent = Rectangle((1.2, 2.97, 1.2), (np.cos(bend), np.sin(bend), 0), (0, 0, 1), (0.6, 1.2))
+    stage = Stage([WALL, FLOOR, replace(bent, size=(0.11, 1.2))])
+    _, ids = stage.show(HERE, rectangles=[WALL, FLOOR, bent])
+    scrap, wall = ids[2][0], ids[0][0]
+    for x in (0.0, 0.1):
+        seen, ids = stage.show(looking((x, 0.0, 1.4), (0.9, 3.0, 1.0)))
+        assert ids[2] == [scrap]
+        assert seen.merged == ()
+    seen, _ = stage.show(looking((0.2, 0.0, 1.4), (0.9, 3.0, 1.0)), rectangles=[WALL, FLOOR])
+    assert seen.merged == ((wall, scrap),)
 
 
 def test_a_wall_that_something_hides_in_part_is_one() -> None:

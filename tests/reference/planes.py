@@ -73,26 +73,33 @@ def label_pixels(depth, cell, cx, cy, cell_labels, planes, tolerance):
     return labels
 
 
-def drop_lonely(labels):
-    """Labels that at least 3 of 8 neighbours share; beyond the border the image goes on as at the border."""
+def alike(labels):
+    """[H, W] how many of 8 neighbours share the label; beyond the border the image goes on as at the border."""
     around = np.pad(labels, 1, mode="edge")
-    kept = np.full_like(labels, -1)
+    count = np.zeros(labels.shape, int)
     for v, u in np.ndindex(*labels.shape):
-        if (around[v : v + 3, u : u + 3] == labels[v, u]).sum() >= 4:
-            kept[v, u] = labels[v, u]
-    return kept
+        count[v, u] = (around[v : v + 3, u : u + 3] == labels[v, u]).sum() - 1
+    return count
+
+
+def drop_lonely(labels):
+    """Labels that at least 3 of 8 neighbours share."""
+    return np.where(alike(labels) >= 3, labels, -1)
 
 
 def segment_sums(depth, cell, cx, cy, planes, labels, scale):
-    """{(cell, plane): (weighted moments [10] about the principal point, pixels, squared misfits)}."""
-    found = {}
+    """{(cell, plane): (weighted moments [10] about the principal point, pixels, squared misfits)}.
+
+    Pixels beside others of another label weigh a tenth.
+    """
+    found, rim = {}, alike(labels) < 8
     columns = -(-depth.shape[1] // cell)
     for i, j, pixels in blocks(depth.shape, cell):
         for v, u in pixels:
             k = int(labels[v, u])
             if k >= 0:
                 r = misfit(depth, planes[k], v, u, cx, cy)
-                row = features(u - cx, v - cy, r) / np.sqrt(1.0 + (r / scale) ** 2)
+                row = features(u - cx, v - cy, r) * (0.1 if rim[v, u] else 1.0) / np.sqrt(1.0 + (r / scale) ** 2)
                 old = found.get((i * columns + j, k), (np.zeros(10), 0, 0.0))
                 found[i * columns + j, k] = (old[0] + row, old[1] + 1, old[2] + r * r)
     return found

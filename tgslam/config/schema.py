@@ -235,7 +235,8 @@ class StructureConfig:
     read_margin: float = setting(0.05, 0.0, 1.0)  # ids are read where no other code is less than this farther
     read_opacity: float = setting(0.5, 0.01, 1.0)  # and rendered opacity is at least this
     read_distance_m: float = setting(0.05, 0.0, 10.0)  # and the rendered surface is at most this far from the plane
-    read_sigmas: float = setting(3.0, 0.0, 100.0)  # and so many standard deviations of the sensor's depth
+    read_sigmas: float = setting(3.0, 0.0, 100.0)  # and so many standard deviations of the sensor's depth, and adjoins
+    read_margin_m: float = setting(0.05, 0.001, 10.0)  # what lies no farther than this beyond where the plane was seen
     lambda_str: float = setting(0.05, 0.0, 100.0)  # what E_str weighs; 0 = no regularisers
     omega_flat: float = setting(1.0, 0.0, 100.0)  # of Eq. 8, scales relative to sqrt(s1 s2)
     omega_normal: float = setting(0.3, 0.0, 100.0)  # of Eq. 9

@@ -86,9 +86,12 @@ class PlanarMapping:
         for earlier in keyframes[:-1]:
             self._correct(earlier, observation.corrected)
             self._show_new(earlier, observation.created)
-        ids = self._completed(self._closed(observation.id_image(view.labels)), depth_m, keyframe.T_cw)
+        seen = observation.id_image(view.labels)
+        ids = self._completed(self._closed(seen), depth_m, keyframe.T_cw)
         pixels = self._pixels(ids, depth_m, keyframe.T_cw)
-        keyframe.plane_ids = pixels.ids.astype(np.int16)
+        # Surfaces that wait for other views are no part of those that they may lie close to: they are named later
+        waiting = (view.labels >= 0) & (seen == NO_ID)
+        keyframe.plane_ids = np.where(waiting, NO_ID, pixels.ids).astype(np.int16)
         return pixels
 
     def table(self) -> PlaneTable:

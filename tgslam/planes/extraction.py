@@ -45,8 +45,9 @@ def extract_planes(depth_m: np.ndarray, camera: Camera, config: PlanesConfig, si
     noise, pairs = noise_of(pieces.moments), bordering(pieces.labels)
     planes, _, _ = parallel(planes_of(pieces.moments), pieces.moments, pairs, agreement, grid.cell_px)
     spread = np.sqrt(squared_residuals(pieces.moments) / pieces.moments[:, 0])
-    pixels.assign(planes, config.pixel_sigmas * np.clip(spread, noise, config.max_rms_sigmas * noise))
+    tolerance = config.pixel_sigmas * np.clip(spread, noise, config.max_rms_sigmas * noise)
     for _ in range(_ROBUST_ROUNDS):
+        pixels.assign(planes, tolerance)
         before = planes
         sums = pixels.sums(before, _CHARBONNIER_SIGMAS * sigma_per_m2)
         moments = np.column_stack([totals(sums, len(before)), noise**2])
@@ -74,8 +75,8 @@ def _pieces(depth_m: np.ndarray, grid: CellGrid, config: PlanesConfig, sigma: fl
     image_px = grid.camera.width * grid.camera.height
     least_px = _PIECE_SHARE * config.min_area_share * image_px
     group = np.where(moments[group, 0] >= least_px, group, -1)
-    group = part_layers(graph, grid.shape, group, lenient, _LAYER_PIECES * least_px)
-    group = settle(graph, grid.shape, group, _LARGE_SHARE * image_px)
+    group, parent = part_layers(graph, grid.shape, group, lenient, _LAYER_PIECES * least_px)
+    group = settle(graph, grid.shape, group, _LARGE_SHARE * image_px, parent)
     pieces = _numbered(graph, group, grid, least_px)
     return bridge(pieces, runtime.to_host(depth_m), grid, agreement, config.across_area_m2), lenient
 

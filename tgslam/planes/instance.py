@@ -36,6 +36,7 @@ class PlanarInstance:
         self.merged_into: PlanarInstance | None = None
         self.split_from: PlanarInstance | None = None
         self.unseen = 0  # keyframes since it was last seen
+        self.seen_past = False  # views have shown that what stands before a gap in it does not part it
         self.through = 0  # keyframes, one after the other, that see through it
         self.taken_by: PlanarInstance | None = None  # to which the latest keyframe to show it has counted it instead
         self.taken = 0  # such keyframes, one after the other
@@ -100,7 +101,7 @@ class PlanarInstance:
             np.array([rms_m]),
         )
         self.keyframes = sorted({*self.keyframes, keyframe})
-        self.unseen = self.through = self.taken = 0
+        self.unseen = self.through = 0
         self.refit(poses)
 
     def absorb(self, other: PlanarInstance, poses: Poses) -> None:
@@ -108,6 +109,7 @@ class PlanarInstance:
         if other._views is not None:
             self._take(other._views, other._view_keyframes, other._view_areas, other._view_rms_m)
         self.keyframes = sorted({*self.keyframes, *other.keyframes})
+        self.seen_past |= other.seen_past
         cells, keyframes = other.support.cells()
         self.support.absorb(other.support.centres(cells), keyframes)
         self.refit(poses)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,10 +31,13 @@ class Joining:
         self._apart: dict[frozenset[PlanarInstance], None] = {}
         # Those of them of which one stands a little before the other
         self._steps: dict[frozenset[PlanarInstance], None] = {}
+        # Those of them that only what stands in the gap parts: by keyframe that shows the gap, whether it is filled
+        self._filled: dict[frozenset[PlanarInstance], dict[int, bool]] = {}
 
     def part(self, a: PlanarInstance, b: PlanarInstance) -> None:
-        """A gap parts two instances in a view."""
+        """A gap parts two instances in a view, for good."""
         self._apart[frozenset((a, b))] = None
+        self._filled.pop(frozenset((a, b)), None)
 
     def step(self, a: PlanarInstance, b: PlanarInstance) -> None:
         """A step parts two instances in a view."""
@@ -51,10 +54,12 @@ class Joining:
 
     def replace(self, absorbed: PlanarInstance, kept: PlanarInstance) -> None:
         """What parts one instance from others parts the one that has absorbed it from them."""
-        self._apart, self._steps = (
-            {pair: None for known in pairs if len(pair := frozenset(kept if i is absorbed else i for i in known)) == 2}
-            for pairs in (self._apart, self._steps)
-        )
+        renamed = {pair: frozenset(kept if i is absorbed else i for i in pair) for pair in self._apart}
+        sure = {renamed[pair] for pair in self._apart if pair not in self._filled}
+        filled = {renamed[pair]: looks for pair, looks in self._filled.items() if renamed[pair] not in sure}
+        self._apart = {pair: None for pair in renamed.values() if len(pair) == 2}
+        self._steps = {renamed[pair]: None for pair in self._steps if renamed[pair] in self._apart}
+        self._filled = {pair: looks for pair, looks in filled.items() if pair in self._apart}
 
     def twins(
         self, touched: Sequence[PlanarInstance], everything: Sequence[PlanarInstance], samples: Samples | None
@@ -97,7 +102,7 @@ class Joining:
 
         Floors, walls and ceilings go on behind things and where no view has looked, those that bound the scene however
         far; table tops are smaller. A gap that has parted two in any view does so for good but where large ones touch,
-        as walls do over a door.
+        as walls do over a door, or where most views show that nothing stands in it.
         """
         large, cells = _on_larger(a, b)
         longest_m = np.inf if bounding else self._config.bridge_m
@@ -105,8 +110,8 @@ class Joining:
         gap = Gap(False, False, False)
         if ways is not None and samples is not None:
             gap = gap_between(samples, *ways, large.plane, self._tolerance)
+        self._look(a, b, gap)
         if gap.parts(max(a.area_m2, b.area_m2), self._config):
-            self.part(a, b)
             return False
         if frozenset((a, b)) in self._apart:
             touching = adjoins(large.support.near(cells, 0.0))
@@ -116,6 +121,25 @@ class Joining:
         if ways is None or samples is None:
             return False
         return gap.hidden or min(a.area_m2, b.area_m2) >= self._config.bridge_area_m2
+
+    def _look(self, a: PlanarInstance, b: PlanarInstance, gap: Gap) -> None:
+        """Remember whether a gap parts two instances in the latest view.
+
+        What is seen through it does for good. What stands in it hides which they are: it parts them as long as half
+        of the views or more show it: in fewer, it is noise.
+        """
+        pair, keyframe = frozenset((a, b)), max(a.keyframes[-1], b.keyframes[-1])
+        filled = not gap.open and gap.parts(max(a.area_m2, b.area_m2), self._config)
+        if gap.open:
+            self.part(a, b)
+        elif filled and pair not in self._apart:
+            self._apart[pair], self._filled[pair] = None, {keyframe: True}
+        elif pair in self._filled and (filled or gap.hidden):
+            looks = self._filled[pair]
+            looks[keyframe] = filled
+            if len(looks) >= self._config.confirm_views and 2 * sum(looks.values()) < len(looks):
+                del self._apart[pair], self._filled[pair]
+                a.seen_past = b.seen_past = True
 
     def _bounds(self, a: PlanarInstance, b: PlanarInstance, everything: Sequence[PlanarInstance]) -> bool:
         """Whether a pair, one of it large, has everything in front of it: floors, walls and ceilings have, which is
@@ -133,20 +157,22 @@ class Joining:
                 other_m2 += other.area_m2
         return other_m2 >= least_m2 and behind_m2 <= _BEHIND_SHARE * other_m2
 
-    def overruled(self, matching: ViewMatching, seen: Collection[PlanarInstance]) -> list[Pair]:
-        """(larger, smaller) instances where view after view counts to the larger one all that it shows of the smaller.
+    def overruled(self, matching: ViewMatching) -> list[Pair]:
+        """(larger, smaller) instances where view after view counts to the larger one most that it shows of the smaller.
 
         Then the smaller one was a part of the larger one that a view at a bad angle or from afar has bent.
         """
         found = []
         for index, view in matching.sights.items():
             instance = matching.instances[index]
-            if instance in seen or len(view.shown) < LEAST_SAMPLES:
+            if len(view.shown) < LEAST_SAMPLES:
                 continue
             owner = self._taker(matching, view.shown)
-            instance.taken = instance.taken + 1 if owner is not None and owner is instance.taken_by else 1
+            instance.taken = instance.taken + 1 if owner is instance.taken_by else 1
             instance.taken_by = owner
-            if owner is not None and instance.taken >= self._config.through_keyframes and self._covers(owner, instance):
+            if owner is None or owner is instance:
+                continue
+            if instance.taken >= self._config.through_keyframes and self._covers(owner, instance):
                 found.append((owner, instance))
         return found
 

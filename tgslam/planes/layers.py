@@ -19,6 +19,9 @@ from tgslam.planes.moments import NOISE, Joints, information, planes_of, summed,
 
 _WINDOW_CELLS = 3  # over which misfits are averaged
 _OFF_SIGMAS = 2.5  # of such means: beyond it a cell stands off
+_LINE_CELLS, _LINE_WIDTH_CELLS = 11, 1.5  # windows along which misfits are averaged to find strips
+_LINE_DIRECTIONS = 8
+_SURE_SIGMAS, _LIKELY_SIGMAS = 4.5, 2.0  # of such means: of a strip at one place at least, and of all of it
 _TYPICAL = 0.75  # quantile of the misfits of such cells that is the step's
 _DEVIATION = 1.4826  # standard deviations that a median of magnitudes stands for
 _ROUNDS = 3
@@ -33,31 +36,43 @@ _STEP_M = 0.1  # along the line of sight at most from one to the other
 
 def part_layers(
     graph: CellGraph, shape: tuple[int, int], group: Indices, agreement: Agreement, least_px: float
-) -> Indices:
+) -> tuple[Indices, Indices]:
     """The group of each node [N], -1 = none, where parts of a group that stand off its plane are groups of their own.
 
     A part is connected, of one side of the plane, at least `least_px` points, and its plane does not agree with that of
-    the rest. shape: rows and columns of cells.
+    the rest. shape: rows and columns of cells. Returns with the group [G] out of which each strip was taken, -1 for all
+    others: cell by cell, strips would be given back.
     """
     group, moments = group.copy(), group_moments(graph, group)
     misfit = _misfits(graph, planes_of(moments)[group])
-    for index in np.flatnonzero(moments[:, 0] > 2 * least_px):
-        nodes = np.flatnonzero(group == index)
-        for part in _standing_off(misfit[nodes], graph.cell[nodes], shape, graph.moments[nodes, 0], least_px):
-            chosen = graph.moments[nodes[part]].sum(axis=0)
-            pair = np.stack([chosen, moments[index] - chosen])
-            if chosen[0] >= least_px and not _agree(pair, agreement):
-                group[nodes[part]] = group.max() + 1
-    return group
+    parents: dict[int, int] = {}
+    for find in (_standing_off, _strips):
+        for index in np.flatnonzero(moments[:, 0] > 2 * least_px):
+            nodes = np.flatnonzero(group == index)
+            for part in find(misfit[nodes], graph.cell[nodes], shape, graph.moments[nodes, 0], least_px):
+                chosen = graph.moments[nodes[part]].sum(axis=0)
+                pair = np.stack([chosen, moments[index] - chosen])
+                if chosen[0] >= least_px and not _agree(pair, agreement):
+                    new = int(group.max()) + 1
+                    group[nodes[part]] = new
+                    if find is _strips:
+                        parents[new] = int(index)
+    parent = _no_parents(group)
+    parent[list(parents)] = list(parents.values())
+    return group, parent
 
 
-def settle(graph: CellGraph, shape: tuple[int, int], group: Indices, large_px: float) -> Indices:
+def settle(
+    graph: CellGraph, shape: tuple[int, int], group: Indices, large_px: float, parent: Indices | None = None
+) -> Indices:
     """The group [N] of each node, where it belongs to that one whose plane it fits best, its neighbours having a say.
 
     It may change to the groups of its neighbours, and to all of more than `large_px` points: those go on behind things.
-    Parts that are not connected are groups of their own then. -1 stays -1.
+    Parts that are not connected are groups of their own then. -1 stays -1. parent: [G] the group that each one's nodes
+    do not change to, see `part_layers`.
     """
-    group = _unmixed(graph, group, large_px)
+    parent = _no_parents(group) if parent is None else parent
+    group = _unmixed(graph, group, large_px, parent)
     grid = np.full(shape, -1, np.intp)
     for _ in range(_ROUNDS):
         moments = group_moments(graph, group)
@@ -67,14 +82,16 @@ def settle(graph: CellGraph, shape: tuple[int, int], group: Indices, large_px: f
         others = ((around != group) & (around >= 0)).any(axis=0) | ~is_large[group]
         open_ = np.flatnonzero((group >= 0) & others)
         settled = group.copy()
-        settled[open_] = _choice(graph.moments[open_], group[open_], around[:, open_], is_large, planes_of(moments))
+        settled[open_] = _choice(
+            graph.moments[open_], group[open_], around[:, open_], is_large, planes_of(moments), parent
+        )
         if (settled == group).all():
             break
         group = settled
     return _connected(graph, shape, group)
 
 
-def _unmixed(graph: CellGraph, group: Indices, large_px: float) -> Indices:
+def _unmixed(graph: CellGraph, group: Indices, large_px: float, parent: Indices) -> Indices:
     """The group [N] of each node, where those of small groups that a large one's plane fits better are that one's.
 
     A small group that is partly on a large plane, partly a little before it, has a plane between the two that fits
@@ -85,7 +102,7 @@ def _unmixed(graph: CellGraph, group: Indices, large_px: float) -> Indices:
         is_large = moments[:, 0] > large_px
         open_ = np.flatnonzero((group >= 0) & ~is_large[group])
         around = np.full((0, len(open_)), -1, np.intp)
-        chosen = _choice(graph.moments[open_], group[open_], around, is_large, planes_of(moments), 0.0)
+        chosen = _choice(graph.moments[open_], group[open_], around, is_large, planes_of(moments), parent, 0.0)
         left = np.bincount(group[open_][chosen != group[open_]], minlength=len(moments))
         mixed = left > _MIXED_SHARE * np.bincount(group[open_], minlength=len(moments))
         if not mixed.any():
@@ -141,17 +158,23 @@ def bordering(labels: Labels) -> Indices:
 
 
 def _choice(
-    moments: Floats, group: Indices, around: Indices, is_large: NDArray[np.bool_], planes: Floats, bonus: float = _LARGE
+    moments: Floats,
+    group: Indices,
+    around: Indices,
+    is_large: NDArray[np.bool_],
+    planes: Floats,
+    parent: Indices,
+    bonus: float = _LARGE,
 ) -> Indices:
     """The best group [K] of nodes with moments [K, 11], out of their own [K], those around [4, K] and large ones.
 
-    is_large, planes: [G + 1] of each group, the last one standing for -1.
+    is_large, planes: [G + 1] of each group, the last one standing for -1. parent: [G + 1] which each one must not join.
     """
     large = np.flatnonzero(is_large)[:, None]
     choices = np.concatenate([group[None], around, np.broadcast_to(large, (len(large), len(group)))])
     cost = _squares(moments, planes[choices])
     cost -= _NEIGHBOUR * (choices[:, None] == around[None]).sum(axis=1) + bonus * is_large[choices]
-    cost[choices < 0] = np.inf
+    cost[(choices < 0) | (choices == parent[group])] = np.inf
     return np.asarray(choices[np.argmin(cost, axis=0), np.arange(len(group))], np.intp)
 
 
@@ -205,15 +228,72 @@ def _standing_off(
         off = side * mean > limit
         if points[off].sum() < least_px:
             continue
-        image = np.zeros(shape, np.uint8)
-        image.ravel()[cell] = off
-        number = cv2.connectedComponents(image, connectivity=8)[1].ravel()[cell]
-        for index in np.flatnonzero(np.bincount(number, points) >= least_px):
-            if index > 0:
-                part, height = number == index, side * misfit
-                # Means reach beyond the part itself
-                parts.append(part & (height > 0.5 * np.quantile(height[part], _TYPICAL)))
+        height = side * misfit
+        for part in _above(limit, side * mean, cell, shape, points, least_px):
+            # Means reach beyond the part itself
+            parts.append(part & (height > 0.5 * np.quantile(height[part], _TYPICAL)))
     return parts
+
+
+def _strips(
+    misfit: Floats, cell: Indices, shape: tuple[int, int], points: Floats, least_px: float
+) -> list[NDArray[np.bool_]]:
+    """Like `_standing_off`: parts so narrow and far away that only means along them tell them from noise.
+
+    What noise does to a sum along a line is told from all other places in the surface: what neighbours err alike is in
+    it.
+    """
+    row, column = (i - i.min() for i in np.divmod(cell, shape[1]))
+    shape = (int(row.max()) + 1, int(column.max()) + 1)
+    cell = row * shape[1] + column
+    mask, image = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    mask.ravel()[cell], image.ravel()[cell] = 1.0, misfit
+    found: list[tuple[float, NDArray[np.bool_]]] = []
+    for window in _LINE_WINDOWS:
+        cells, sums = (cv2.filter2D(i, -1, window, borderType=cv2.BORDER_CONSTANT).ravel()[cell] for i in (mask, image))
+        whole = cells >= 0.5 * float(window.sum())
+        sums = np.where(whole, sums / np.sqrt(np.maximum(cells, 1.0)), 0.0)
+        sigma = _DEVIATION * float(np.median(np.abs(sums[whole]))) if whole.any() else 0.0
+        for height in (sums, -sums):
+            if height.max() > _SURE_SIGMAS * sigma:
+                parts = _above(_LIKELY_SIGMAS * sigma, height, cell, shape, points, least_px)
+                found += [(float(height[part].max() / sigma), part) for part in parts]
+    chosen: list[NDArray[np.bool_]] = []
+    for sigmas, part in sorted(found, key=lambda item: -item[0]):
+        if sigmas > _SURE_SIGMAS and not any((part & other).any() for other in chosen):
+            chosen.append(part)
+    return chosen
+
+
+def _above(
+    limit: float, height: Floats, cell: Indices, shape: tuple[int, int], points: Floats, least_px: float
+) -> list[NDArray[np.bool_]]:
+    """The connected parts, as masks [K], of the nodes that have more than that height [K], of `least_px` points."""
+    image = np.zeros(shape, np.uint8)
+    image.ravel()[cell] = height > limit
+    number = cv2.connectedComponents(image, connectivity=8)[1].ravel()[cell]
+    return [number == index for index in np.flatnonzero(np.bincount(number, points) >= least_px) if index > 0]
+
+
+def _line_windows() -> list[NDArray[np.float32]]:
+    """Lines through the middle of a square of cells, in directions equally far apart."""
+    reach = _LINE_CELLS // 2
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    windows = []
+    for angle in np.arange(_LINE_DIRECTIONS) * np.pi / _LINE_DIRECTIONS:
+        across = np.abs(y * np.cos(angle) - x * np.sin(angle))
+        along = np.abs(y * np.sin(angle) + x * np.cos(angle))
+        inside = np.clip(0.5 * (_LINE_WIDTH_CELLS + 1) - across, 0.0, 1.0)
+        windows.append((inside * np.clip(0.5 * (_LINE_CELLS + 1) - along, 0.0, 1.0)).astype(np.float32))
+    return windows
+
+
+_LINE_WINDOWS = _line_windows()
+
+
+def _no_parents(group: Indices) -> Indices:
+    """[G + 1] for groups none of which was taken out of another one."""
+    return np.full(int(group.max(initial=-1)) + 2, -1, np.intp)
 
 
 def _agree(pair: Floats, agreement: Agreement) -> bool:

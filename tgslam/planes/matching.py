@@ -24,6 +24,8 @@ LEAST_SAMPLES = 12  # of a plane's extent in view, for the view to say something
 WELL = 0.5  # of the gate: planes agree well
 _CAREFUL_IOU = 0.15  # of masks that are matched one to one; less is for pieces, which `continued` is for
 _LENIENT_IOU = 0.5  # likewise without care
+_MAIN_SHARE = 0.5  # of what a segment has in common with any instance that it fits, that it has with its own
+_MOST = 0.5  # of a segment that lies on the extent of what it is no new part of
 _GAP_RATIO = 2.0  # the longest gap in sizes of the smaller surface
 _GAP_SLACK_CELLS = 2.0  # wider than at its narrowest place, a gap is not looked at
 _TOUCHING_CELLS = 1.5  # apart, cells are neighbours: then only those that touch say whether there is a gap
@@ -82,6 +84,9 @@ class ViewMatching:
         agreement = (self._careful if careful else self._lenient)[np.ix_(free, seen)]
         allowed = agreement.admitted & self._meet(masks)[free]
         allowed &= masks.iou[free] >= (_CAREFUL_IOU if careful else _LENIENT_IOU)
+        # A piece of one surface is no other surface that happens to have a part of its extent
+        common = np.where(agreement.admitted, masks.intersection[free], 0)
+        allowed &= common >= _MAIN_SHARE * common.max(axis=1, keepdims=True)
         pairs = assign(matching_cost(agreement, masks.iou[free], self.config), allowed)
         return [(free[row], instances[column]) for row, column in pairs]
 
@@ -209,13 +214,15 @@ class ViewMatching:
         """
         pieces = self.pieces(instance)
         own = self.samples.footprint(segment, instance.support)
+        whole = instance.seen_past and float(np.mean(instance.support.holds(own))) > _MOST
         for piece in pieces:
             other = self.samples.footprint(piece, instance.support)
             ways = narrowest(instance.support, own, other)
             if ways is None or instance.support.connects(own, other):
                 return False
             larger_m2 = max(self.segments[segment].area_m2, self.segments[piece].area_m2)
-            if not gap_between(self.samples, *ways, instance.plane, self.tolerance).parts(larger_m2, self.config):
+            gap = gap_between(self.samples, *ways, instance.plane, self.tolerance)
+            if not (gap.open if whole else gap.parts(larger_m2, self.config)):
                 return False
         return bool(pieces)
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tgslam import runtime
 from tgslam.config.schema import StructureConfig
+from tgslam.geometry import inverse, transform_points
 from tgslam.planes import codes
 from tgslam.planes.instance import NO_ID
+from tgslam.planes.outline import Outline
 from tgslam.splatting.images import RenderImages
 from tgslam.types import Camera, FloatImage, Matrix4, Plane
 
@@ -21,8 +24,8 @@ class PlaneReader:
     """Reads ids off renderings for one camera.
 
     Where two surfaces blend, the mixture may look like a third one. It is nowhere near, though, so an id holds only
-    where the rendered surface lies on its plane; and what remains undecided is held against mixtures of what the pixels
-    around show.
+    where the rendered surface lies on its plane, and adjoins where that has been seen; and what remains undecided is
+    held against mixtures of what the pixels around show.
     """
 
     def __init__(
@@ -31,6 +34,7 @@ class PlaneReader:
         """depth_sigma_per_m2: the sensor's noise, sigma_z = this * z^2, m."""
         self.config, self.sigma_per_m2 = config, depth_sigma_per_m2
         self.planes = sorted(planes, key=lambda plane: plane.id)
+        self._outlines = [Outline(plane, config.read_margin_m) for plane in self.planes]
         self._rays = camera.rays()
 
     def read(self, images: RenderImages, T_cw: Matrix4) -> NDArray[np.int32]:
@@ -60,13 +64,23 @@ class PlaneReader:
         return result
 
     def on_planes(self, ids: NDArray[np.int32], depth_m: FloatImage, T_cw: Matrix4) -> NDArray[np.int32]:
-        """The ids [H, W] but for those pixels whose surface, at depth_m [H, W] m, is not on their plane: -1."""
-        result = np.full_like(ids, NO_ID)
-        for plane in self.planes:
+        """The ids [H, W] but for those pixels whose surface, at depth_m [H, W] m, is not on their plane: -1.
+
+        Nor have connected pixels an id if none of them is where that plane has been seen.
+        """
+        result, T_wc = np.full_like(ids, NO_ID), inverse(T_cw)
+        for plane, outline in zip(self.planes, self._outlines, strict=True):
             at = np.nonzero(ids == plane.id)
             normal = T_cw[:3, :3] @ plane.normal_w
             z = depth_m[at].astype(np.float64)
             distance = np.abs(z * (self._rays[at] @ normal) + plane.offset_m - normal @ T_cw[:3, 3])
             near = distance <= self.config.read_distance_m + self.config.read_sigmas * self.sigma_per_m2 * z**2
-            result[at[0][near], at[1][near]] = plane.id
+            rows, columns = at[0][near], at[1][near]
+            seen = outline.holds(transform_points(T_wc, self._rays[rows, columns] * z[near, None]))
+            if not seen.all():
+                shown = np.zeros(ids.shape, np.uint8)
+                shown[rows, columns] = 1
+                part = cv2.connectedComponents(shown, connectivity=8)[1][rows, columns]
+                seen = np.isin(part, part[seen])
+            result[rows[seen], columns[seen]] = plane.id
         return result

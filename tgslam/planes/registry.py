@@ -101,7 +101,7 @@ class PlaneRegistry:
         created = self._confirm(seen, matching)
         removed = self._weigh_contradictions(matching, seen)
         created += self._split(seen)
-        merged = [*self._overrule(matching, seen), *self._merge(seen, samples)]
+        merged = [*self._overrule(matching), *self._merge(seen, samples)]
         ids = [self._id_of(owner, keyframe) for owner in matching.owner]
         shrunk = tuple(sorted({instance.id for instance in corrected if instance.id != NO_ID}))
         return Observation(keyframe, np.array(ids, np.int32), tuple(created), tuple(merged), tuple(removed), shrunk)
@@ -219,10 +219,10 @@ class PlaneRegistry:
         self._instances += parts
         return [self._name(part) for part in parts]
 
-    def _overrule(self, matching: ViewMatching, seen: list[PlanarInstance]) -> list[tuple[int, int]]:
+    def _overrule(self, matching: ViewMatching) -> list[tuple[int, int]]:
         """Let go of instances that views count to another one: that takes their ids, but not their bent planes."""
         merged: list[tuple[int, int]] = []
-        for kept, bent in self._joining.overruled(matching, seen):
+        for kept, bent in self._joining.overruled(matching):
             if kept in self._instances and bent in self._instances:
                 merged += self._replace(bent, kept)
         return merged
