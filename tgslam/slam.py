@@ -24,7 +24,7 @@ from tgslam.planes.cue import StructureCue
 from tgslam.tracking.exposure import Exposure
 from tgslam.tracking.motion import ConstantVelocity
 from tgslam.tracking.pyramid import NO_PLANES
-from tgslam.tracking.reference import Reference
+from tgslam.tracking.reference import Reference, references_of
 from tgslam.tracking.result import TrackingResult
 from tgslam.tracking.solver import make_tracker, track_or_recover
 from tgslam.types import Camera, Frame, FrameReport, FrameStatus, Gaussians, Plane, Trajectory
@@ -157,11 +157,13 @@ class Slam:
         self.tracker.know(planes_w, self._references())
 
     def _references(self) -> list[Reference]:
-        """The last keyframe, and those before it that most of the map in its view was seeded from."""
-        last = self.mapper.keyframes[-1]
-        before = sorted(last.seen, key=lambda number: -last.seen[number])
-        chosen = [last, *(self.mapper.keyframes[number] for number in before)][: self._reference_count]
-        return [Reference(k.colour(), k.depth_m(), k.T_cw, k.exposure) for k in chosen]
+        keyframes = self.mapper.keyframes
+        depth_m = keyframes[-1].depth_m()
+        median_m = float(np.median(depth_m[depth_m > 0])) if depth_m.any() else 0.0
+        chosen = references_of(np.stack([k.T_cw for k in keyframes]), median_m, self._reference_count)
+        return [
+            Reference(k.colour(), k.depth_m(), k.T_cw, k.exposure) for k in (keyframes[number] for number in chosen)
+        ]
 
     def _match_brightness(self, keyframe: Keyframe) -> None:
         previous = self.mapper.keyframes[-1]

@@ -32,7 +32,8 @@ _MIN_COSINE = 0.1  # a surface more grazing than this says nothing of the depth 
 _MAX_SLANT = 0.1  # nor one whose depth changes by more within a block
 _NOTICED_M = 0.005  # by which keyframes have moved against each other, for the map between them to be refined
 import os
-_FINAL_PACE = float(os.environ.get('FP','0.05'))
+
+_FINAL_PACE = float(os.environ.get("FP", "0.05"))
 _LAST_PACE = 0.3  # after a motion, steps get smaller down to this share
 _GUESS_SHARE = 0.8  # of a later guess of depth: an earlier one that is less is wrong
 _STEEPEST = 0.1  # deepest a Gaussian may be at the rim of the image, standard deviation over depth

@@ -77,11 +77,17 @@ class Refiner:
             self.structure.set_planes(planes)
 
     def step(
-        self, gaussians: GaussianMap, keyframe: Keyframe, *, move_pose: bool, pace: float = 1.0, colour_pace: float = 1.0
+        self,
+        gaussians: GaussianMap,
+        keyframe: Keyframe,
+        *,
+        move_pose: bool,
+        pace: float = 1.0,
+        colour_pace: float = 1.0,
     ) -> losses.LossResult:
         """Render the map at the keyframe, and move the map (and the keyframe's pose) downhill.
 
-        pace: what the map's steps are multiplied by, but for those of embeddings.
+        pace: what the map's steps are multiplied by, but for those of embeddings. colour_pace: those of colours besides.
 
         Returns the loss before the step; its numbers can be read until the next step. Only the pose's gradient goes to
         the host by itself.
@@ -123,7 +129,12 @@ class Refiner:
         return self.rasterizer.backward(gaussians, g, self._gradient)
 
     def _update_map(
-        self, gaussians: GaussianMap, loss: losses.LossResult, pgi: InstanceGradient | None, pace: float, colour_pace: float
+        self,
+        gaussians: GaussianMap,
+        loss: losses.LossResult,
+        pgi: InstanceGradient | None,
+        pace: float,
+        colour_pace: float,
     ) -> None:
         gradient, visible = self._gradient, self.rasterizer.tile_count
         if self.structure:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,22 @@ from tgslam.types import Camera, Frame
 
 _CONVERGED = 1e-5  # rad and m: a smaller step ends a level
 _DAMPING = 1e-6  # of the normal matrix's trace
+
+
+@dataclass
+class _Match:
+    """A keyframe to which a frame is being aligned."""
+
+    levels: list[ModelLevel]
+    T_rm: NDArray[np.float64]  # [4, 4] its camera from where the map was rendered
+    exposure: Exposure  # of the frame, against its image
+
+    @classmethod
+    def of(
+        cls, levels: list[ModelLevel], reference: Reference, T_mw: NDArray[np.float64], exposure: Exposure
+    ) -> _Match:
+        """exposure: of the frame, against the map."""
+        return cls(levels, reference.T_cw @ inverse(T_mw), exposure.relative_to(reference.exposure))
 
 
 class GaussNewtonTracker:
@@ -127,10 +144,14 @@ class GaussNewtonTracker:
         finest level. Coarser ones have fewer pixels to hold against it, so it counts as much less there.
         """
         T_ml = np.eye(4)
+        matches = [_Match.of(levels, reference, T_mw, exposure) for levels, reference in self._references]
         for level in reversed(range(len(live))):
             for _ in range(self.config.iterations[level]):
-                equations = self._equations(level, live[level], model[level], T_mw, T_ml, exposure)
+                equations = self._linearise[level](live[level], model[level], T_ml, exposure)
                 exposure = fit_exposure(equations.intensity, self.config.exposure, exposure)
+                for match in matches:
+                    equations = equations.joined(self._of_reference(match, level, live[level], T_ml), match.T_rm)
+                equations = equations.scaled(1.0 / (1 + len(matches)))  # the frame's own errors are in all of them
                 # a weak damping holds the directions that nothing observes
                 damping = _DAMPING * np.trace(equations.A) + 1e-9
                 drawn = prior / 4**level
@@ -141,19 +162,8 @@ class GaussNewtonTracker:
                     break
         return T_ml, exposure, equations
 
-    def _equations(
-        self,
-        level: int,
-        live: LiveLevel,
-        model: ModelLevel,
-        T_mw: NDArray[np.float64],
-        T_ml: NDArray[np.float64],
-        exposure: Exposure,
-    ) -> NormalEquations:
-        """Of the map and of the references; what is said of the match is said of the map's."""
-        equations = self._linearise[level](live, model, T_ml, exposure)
-        for levels, reference in self._references:
-            T_rm = reference.T_cw @ inverse(T_mw)
-            between = exposure.relative_to(reference.exposure)
-            equations = equations.joined(self._linearise[level](live, levels[level], T_rm @ T_ml, between), T_rm)
+    def _of_reference(self, match: _Match, level: int, live: LiveLevel, T_ml: NDArray[np.float64]) -> NormalEquations:
+        """Its exposure is fitted to its own image: by that of the map, a blank wall's shading would draw the camera."""
+        equations = self._linearise[level](live, match.levels[level], match.T_rm @ T_ml, match.exposure)
+        match.exposure = fit_exposure(equations.intensity, self.config.exposure, match.exposure)
         return equations

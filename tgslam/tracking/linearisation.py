@@ -39,6 +39,10 @@ class NormalEquations:
         moved = adjoint(T_om)
         return replace(self, A=self.A + moved.T @ other.A @ moved, b=self.b + moved.T @ other.b)
 
+    def scaled(self, factor: float) -> NormalEquations:
+        """Of evidence that counts that much; the statistics stay."""
+        return replace(self, A=factor * self.A, b=factor * self.b)
+
 
 class _Kernels(Protocol):
     """How a device evaluates the sums."""
