@@ -144,6 +144,20 @@ def test_what_is_too_grazing_for_depth_is_not_guessed_in_the_air():
     np.testing.assert_array_equal(depth_m.ravel()[guess.source[beyond]], np.float32(wall_m))
 
 
+def test_a_floor_that_becomes_too_grazing_goes_on_to_the_wall():
+    """A floor 0.5 m below the camera, without depth from 2.2 m on, before a wall at 6 m."""
+    focal_px = 277.0
+    down = (np.arange(100)[:, None] - 5.0) / focal_px * np.ones((1, 80))
+    floor_m = 0.5 / np.maximum(down, 1e-6)
+    exact_m = np.minimum(floor_m, 6.0)
+    hole = (floor_m > 2.2) & (floor_m < 6.0)
+    noise = 1.0 + SIGMA * np.random.default_rng(0).normal(size=exact_m.shape) * exact_m
+    guess = depth.filled(np.where(hole, 0.0, exact_m * noise).astype(np.float32), focal_px)
+    assert hole.sum() > 1000 and not (guess.source >= 0).any()
+    error = abs(guess.depth_m - exact_m)[hole] / exact_m[hole]
+    assert np.median(error) < 0.1 and error.max() < 0.3
+
+
 def test_a_wide_hole_in_a_slope_is_bridged():
     exact_m = plane()
     depth_m = exact_m.copy()

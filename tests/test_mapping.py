@@ -354,6 +354,20 @@ def test_the_final_refinement_can_be_off(source: SyntheticSource) -> None:
         assert np.isin(after.mean[:, 0], before.mean[:, 0]).all()
 
 
+def test_the_final_pass_leaves_the_mean_brightness_of_the_views(source: SyntheticSource) -> None:
+    """Frames that differ in brightness alone: none of them, the last one least of all, has the map to itself."""
+    frame = source.read(0)
+    gains = np.array([0.8, 0.9, 1.0, 1.1, 1.2], np.float32)
+    frames = [replace(frame, index=k, colour=np.clip(frame.colour, 0, 0.8) * gain) for k, gain in enumerate(gains)]
+    for last in range(0, 5, 2):
+        mapper = make_mapper(source)
+        for one in np.roll(np.arange(5), 4 - last):
+            mapper.add_keyframe(Keyframe.from_frame(frames[one], np.eye(4), Exposure(), np.eye(6)))
+        mapper.finish()
+        brightness = view(mapper, np.eye(4)).colour.mean() / np.clip(frame.colour, 0, 0.8).mean()
+        assert brightness == pytest.approx(1.0, abs=0.03)
+
+
 def test_pose_refinement_takes_a_disturbed_keyframe_back(source: SyntheticSource) -> None:
     mapper = mapped(source, range(0, 25, 5), refine_poses=False, iterations=30)
     middle = mapper.keyframes[2]

@@ -27,7 +27,7 @@ from tgslam.tracking.gauss_newton import GaussNewtonTracker
 from tgslam.tracking.lost import LostDetector
 from tgslam.tracking.motion import ConstantVelocity
 from tgslam.tracking.pyramid import NO_PLANES, LiveLevel, LivePyramid, ModelLevel, ModelPyramid, finest_level
-from tgslam.tracking.reference import Reference
+from tgslam.tracking.reference import Reference, references_of
 from tgslam.tracking.result import TrackingResult
 from tgslam.tracking.solver import make_tracker, track_or_recover
 from tgslam.types import Camera, Frame
@@ -348,6 +348,30 @@ def test_keyframes_as_they_were_measured_count_as_much_as_the_map():
         forward_m.append((MOTION @ inverse(result.T_cw))[2, 3])
     assert forward_m[0] == pytest.approx(scene.OFF_M, rel=0.2)
     np.testing.assert_allclose(forward_m, forward_m[0] / np.array([1, 2, 3, 3]), rtol=0.05)
+
+
+def poses_at(*camera: tuple[float, float]) -> np.ndarray:
+    """T_cw [K, 4, 4] of cameras (distance along x in m, angle about y in degrees)."""
+    return np.stack([inverse(se3_exp([0, 0, 0, x, 0, 0]) @ se3_exp([0, np.radians(a), 0, 0, 0, 0])) for x, a in camera])
+
+
+@pytest.mark.parametrize(
+    ("cameras", "expected"),
+    [
+        ([(0, 0)], [0]),
+        ([(0, 0), (0.5, 0), (1, 0)], [2, 0]),  # the oldest
+        ([(-2, 0), (0, 0), (1, 0)], [2, 1]),  # within 0.8 of the depth
+        ([(0, 40), (0, 20), (0, 0)], [2, 1]),  # and 30 degrees
+        ([(-2, 0), (0, 90), (0, 0)], [2]),
+    ],
+)
+def test_references_are_the_last_keyframe_and_the_oldest_like_it(cameras, expected):
+    assert references_of(poses_at(*cameras), 2.0, 2) == expected
+
+
+def test_references_are_as_many_as_asked_for():
+    poses = poses_at(*((0.01 * k, 0) for k in range(5)))
+    assert [references_of(poses, 2.0, count) for count in range(4)] == [[], [4], [4, 0], [4, 0, 1]]
 
 
 def test_what_is_known_replaces_what_was():

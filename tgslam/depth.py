@@ -19,6 +19,8 @@ _MIN_NEIGHBOURS = 4
 _RANGE_SIGMAS = 3.0  # nearer to the farthest measurement than this, noise decides what is in range
 _RANGE_WINDOW_PX = 17  # much wider than the seams without depth along edges
 _RANGE_SHARE = 0.85  # of the window that has depth; then a surface reads at most 0.3 sigma too near
+_SAME_PLANE = 0.1  # of inverse depth by which a guess differs in the median from a plane that it goes on
+_AFFINE_WINDOW_PX = 15
 _NARROW_PX = 2  # a hole's pixels that are no farther from a measurement are at an edge
 
 
@@ -84,6 +86,7 @@ def filled(depth_m: NDArray[np.float32], focal_px: float) -> Guess:
     inverse depth, in which planes are affine, interpolated from coarser and coarser means. Where that is steeper than
     what returns light, it leads from one surface to another: a side too grazing for the sensor, or what the nearer one
     hides from its light. How far that goes is not known, and the guess is the farther surface: nothing hangs before it.
+    But where the nearer one's plane leads there as well, a floor perhaps, it goes on.
 
     depth_m: [H, W], 0 = none. Measurements stay as they are; an image without any comes back as it is.
     """
@@ -96,12 +99,53 @@ def filled(depth_m: NDArray[np.float32], focal_px: float) -> Guess:
     near = cv2.dilate(valid.astype(np.uint8), _square(_NARROW_PX)) > 0
     guess_m = np.where(near, depth_m.ravel()[nearest_measured(depth_m)], 1.0 / mean)
     step = ~near & _steep(mean, focal_px)
+    step &= ~_goes_on(np.where(valid, inverse, np.float32(0.0)), mean, step)
     behind_m = np.where(valid & (inverse < _least_around(mean, step)), depth_m, np.float32(0.0))
     if behind_m.any():
         nearest = nearest_measured(behind_m)
         source = np.where(step & (depth_m.ravel()[nearest] > guess_m), nearest, source)
         guess_m = np.where(source >= 0, depth_m.ravel()[source], guess_m)
     return Guess(guess_m.astype(np.float32), source)
+
+
+def _goes_on(inverse: NDArray[np.float32], mean: NDArray[np.float32], step: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """[H, W] the connected steps through which the surface before them continues: the mean is its plane's.
+
+    inverse: [H, W] of depth, 1/m, 0 = none.
+    """
+    goes_on = np.zeros(step.shape, bool)
+    most = cv2.dilate(np.where(step, mean, np.float32(0.0)), _square(_NARROW_PX + 1))
+    before = (most > 0) & (inverse > most)
+    if not before.any():
+        return goes_on
+    nearest = nearest_measured(before.astype(np.float32))[step]
+    w, across, down = (image.ravel()[nearest] for image in _affine(inverse))
+    v, u = np.nonzero(step)
+    from_v, from_u = np.divmod(nearest, step.shape[1])
+    off = np.abs((w + across * (u - from_u) + down * (v - from_v)) / mean[step] - 1.0)
+    number = cv2.connectedComponents(step.astype(np.uint8))[1][step]
+    for index in range(1, int(number.max()) + 1):
+        part = number == index
+        goes_on[v[part], u[part]] = np.median(off[part]) < _SAME_PLANE
+    return goes_on
+
+
+def _affine(image: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Local least squares planes of what is not 0: value and slopes across and down, px^-1, each [H, W]."""
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float64)
+    given = (image > 0).astype(np.float64)
+
+    def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        window = (_AFFINE_WINDOW_PX, _AFFINE_WINDOW_PX)
+        return np.asarray(cv2.blur(given * values, window, borderType=cv2.BORDER_CONSTANT) / share)
+
+    share = np.maximum(cv2.blur(given, (_AFFINE_WINDOW_PX, _AFFINE_WINDOW_PX), borderType=cv2.BORDER_CONSTANT), 1e-9)
+    mu, mv, mw = mean(u), mean(v), mean(image.astype(np.float64))
+    uu, vv, uv = mean(u * u) - mu * mu, mean(v * v) - mv * mv, mean(u * v) - mu * mv
+    uw, vw = mean(u * image) - mu * mw, mean(v * image) - mv * mw
+    det = np.maximum(uu * vv - uv * uv, 1e-6)
+    across, down = (vv * uw - uv * vw) / det, (uu * vw - uv * uw) / det
+    return mw + across * (u - mu) + down * (v - mv), across, down
 
 
 def _least_around(image: NDArray[np.float32], chosen: NDArray[np.bool_]) -> NDArray[np.float32]:

@@ -128,7 +128,7 @@ class SeedingConfig:
     )  # the image, about so many of the largest cells: doublings of the smallest
     plane_cells_across: int = setting(40, 1, 10_000)  # likewise on one plane (PGI)
     plain_colour_std: float = setting(0.015, 0.0, 1.0)  # a cell whose channels vary less has no texture
-    plane_colour_std: float = setting(0.015, 0.0, 1.0)  # likewise for a cell on one plane, but for a linear trend
+    plane_colour_std: float = setting(0.022, 0.0, 1.0)  # likewise for a cell on one plane, but for a linear trend
     planar_sigmas: float = setting(2.0, 0.0, 100.0)  # a cell whose plane residual is less, in sensor sigmas, is flat
     overlap: float = setting(0.6, 0.1, 3.0)  # standard deviation of a Gaussian in cell sizes
     thickness: float = setting(0.1, 1e-3, 1.0)  # standard deviation along the normal, relative to across
@@ -146,8 +146,8 @@ class MappingConfig:
     )  # earlier ones that are refined with it
     anchor_count: int = setting(2, 0, 1000)  # SGVs, whose poses hold still
     iterations: int = setting(12, 0, 10_000)  # views rendered and refined a keyframe
-    final_iterations: int = setting(60, 0, 1_000_000)  # after the last frame, over all keyframes; 0 = off
-    refine_poses: bool = setting(False)
+    final_iterations: int = setting(120, 0, 1_000_000)  # after the last frame, over all keyframes; 0 = off
+    refine_poses: bool = setting(False)  # in the window; tracking has been the better judge since it knows references
     insert_opacity: float = setting(0.6, 0.0, 1.0)  # the map does not explain a pixel that it covers less than this
     insert_sigmas: float = setting(8.0, 0.0, 1000.0)  # nor one whose surface stands this far in front of the map's
     coarse_factor: float = setting(2.5, 1.0, 100.0)  # Gaussians this much larger than needed are seeded anew, finer

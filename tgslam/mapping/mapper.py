@@ -31,9 +31,7 @@ if TYPE_CHECKING:
 _MIN_COSINE = 0.1  # a surface more grazing than this says nothing of the depth beside
 _MAX_SLANT = 0.1  # nor one whose depth changes by more within a block
 _NOTICED_M = 0.005  # by which keyframes have moved against each other, for the map between them to be refined
-import os
-
-_FINAL_PACE = float(os.environ.get("FP", "0.05"))
+_FINAL_PACE = 0.05  # in the final pass steps of colours do, or the map would have the brightness of the last views
 _LAST_PACE = 0.3  # after a motion, steps get smaller down to this share
 _GUESS_SHARE = 0.8  # of a later guess of depth: an earlier one that is less is wrong
 _STEEPEST = 0.1  # deepest a Gaussian may be at the rim of the image, standard deviation over depth
@@ -126,7 +124,7 @@ class Mapper:
         self.refiner.step(self.gaussians, view, move_pose=self._may_move(view), pace=pace)
 
     def finish(self) -> None:
-        """The final pass: every keyframe in turn, in random order, poses fixed."""
+        """The final pass: every keyframe in turn, in random order, poses fixed, until colours are the mean of views."""
         if self.planes:
             self.planes.complete(self.keyframes)
         rounds = range(0, self.config.final_iterations, max(len(self.keyframes), 1))

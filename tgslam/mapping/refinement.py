@@ -87,7 +87,8 @@ class Refiner:
     ) -> losses.LossResult:
         """Render the map at the keyframe, and move the map (and the keyframe's pose) downhill.
 
-        pace: what the map's steps are multiplied by, but for those of embeddings. colour_pace: those of colours besides.
+        pace: what the map's steps are multiplied by, but for those of embeddings.
+        colour_pace: and those of colours besides.
 
         Returns the loss before the step; its numbers can be read until the next step. Only the pose's gradient goes to
         the host by itself.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tgslam.geometry import inverse
 from tgslam.tracking.exposure import Exposure
 
-_BASELINE = 0.4  # between two views that show the same alike at most, relative to the median depth
+_BASELINE = 0.8  # between two views that show the same alike at most, relative to the median depth
 _LEAST_COSINE = 0.87  # of the angle between their axes: 30 degrees
 
 
