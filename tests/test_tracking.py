@@ -362,6 +362,7 @@ def poses_at(*camera: tuple[float, float]) -> np.ndarray:
         ([(0, 0), (0.5, 0), (1, 0)], [2, 0]),  # the oldest
         ([(-2, 0), (0, 0), (1, 0)], [2, 1]),  # within 0.8 of the depth
         ([(0, 40), (0, 20), (0, 0)], [2, 1]),  # and 30 degrees
+        ([(0, -90), (1, -90), (1.3, -90)], [2, 1]),  # and ahead within 0.2 of the depth
         ([(-2, 0), (0, 90), (0, 0)], [2]),
     ],
 )

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from tgslam.geometry import inverse
 from tgslam.tracking.exposure import Exposure
 
-_BASELINE = 0.8  # between two views that show the same alike at most, relative to the median depth
+# Between two views that show the same alike at most, relative to the median depth: from farther away noise is larger
+_BASELINE = 0.8
+_BASELINE_AHEAD = 0.2
 _LEAST_COSINE = 0.87  # of the angle between their axes: 30 degrees
 
 
@@ -27,10 +29,12 @@ class Reference:
 def references_of(T_cw: NDArray[np.float64], median_depth_m: float, count: int) -> list[int]:
     """The last keyframe and the oldest ones that show alike what it shows: `count` at most of the poses T_cw [K, 4, 4].
 
-    The oldest have drifted least. From farther away than these, noise and what hides what differ too much.
+    The oldest have drifted least.
     """
     T_wc = inverse(T_cw)
-    baseline_m = np.linalg.norm(T_wc[:, :3, 3] - T_wc[-1, :3, 3], axis=1)
-    alike = (baseline_m <= _BASELINE * median_depth_m) & (T_wc[:, :3, 2] @ T_wc[-1, :3, 2] >= _LEAST_COSINE)
+    from_last_m = T_wc[:, :3, 3] - T_wc[-1, :3, 3]
+    alike = np.linalg.norm(from_last_m, axis=1) <= _BASELINE * median_depth_m
+    alike &= np.abs(from_last_m @ T_wc[-1, :3, 2]) <= _BASELINE_AHEAD * median_depth_m
+    alike &= T_wc[:, :3, 2] @ T_wc[-1, :3, 2] >= _LEAST_COSINE
     last = len(T_cw) - 1
     return [last, *np.flatnonzero(alike[:last]).tolist()][:count]
