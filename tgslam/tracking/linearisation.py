@@ -35,9 +35,18 @@ class NormalEquations:
     intensity: IntensityMoments
 
     def joined(self, other: NormalEquations, T_om: NDArray[np.float64]) -> NormalEquations:
-        """With those of another model, whose camera is T_om [4, 4] from this one's; the statistics are this one's."""
+        """With those of another model, whose camera is T_om [4, 4] from this one's; the statistics are this one's.
+
+        But colours have to fit both: their residual is the larger one, if the other matches at least half as much.
+        """
         moved = adjoint(T_om)
-        return replace(self, A=self.A + moved.T @ other.A @ moved, b=self.b + moved.T @ other.b)
+        counts = other.matched >= 0.5 * self.matched
+        return replace(
+            self,
+            A=self.A + moved.T @ other.A @ moved,
+            b=self.b + moved.T @ other.b,
+            colour_residual=max(self.colour_residual, other.colour_residual if counts else 0.0),
+        )
 
     def scaled(self, factor: float) -> NormalEquations:
         """Of evidence that counts that much; the statistics stay."""
