@@ -151,7 +151,6 @@ class GaussNewtonTracker:
                 exposure = fit_exposure(equations.intensity, self.config.exposure, exposure)
                 for match in matches:
                     equations = equations.joined(self._of_reference(match, level, live[level], T_ml), match.T_rm)
-                equations = equations.scaled(1.0 / (1 + len(matches)))  # the frame's own errors are in all of them
                 # a weak damping holds the directions that nothing observes
                 damping = _DAMPING * np.trace(equations.A) + 1e-9
                 drawn = prior / 4**level

@@ -48,10 +48,6 @@ class NormalEquations:
             colour_residual=max(self.colour_residual, other.colour_residual if counts else 0.0),
         )
 
-    def scaled(self, factor: float) -> NormalEquations:
-        """Of evidence that counts that much; the statistics stay."""
-        return replace(self, A=factor * self.A, b=factor * self.b)
-
 
 class _Kernels(Protocol):
     """How a device evaluates the sums."""
