@@ -22,7 +22,7 @@ from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.mapper import Mapper
 from tgslam.planes.cue import StructureCue
 from tgslam.tracking.exposure import Exposure
-from tgslam.tracking.motion import ConstantVelocity
+from tgslam.tracking.motion import MotionFilter
 from tgslam.tracking.pyramid import NO_PLANES
 from tgslam.tracking.reference import Reference, references_of
 from tgslam.tracking.result import TrackingResult
@@ -53,7 +53,7 @@ class Slam:
         self._reference_count = config.tracking.references
         self._matches_brightness = config.tracking.exposure == "gain"
         self.tracker = make_tracker(camera, config.tracking, config.loss)
-        self.motion = ConstantVelocity(config.tracking)
+        self.motion = MotionFilter(config.tracking)
         self.selector = KeyframeSelector(config.keyframes)
         rng = np.random.default_rng(config.seed)
         self.mapper = Mapper(
@@ -208,10 +208,11 @@ class Slam:
     def _follow(self, frame: Frame, result: TrackingResult) -> None:
         """The motion model follows the pose as mapping has left it; a lost camera is believed to slow down."""
         latest = self._posed[-1]
-        self.motion.update(frame.timestamp_s, latest.T_ck @ latest.keyframe.T_cw)
+        T_cw = latest.T_ck @ latest.keyframe.T_cw
         if result.lost:
-            self.motion.slow_down()
+            self.motion.coast(frame.timestamp_s, T_cw)
         else:
+            self.motion.update(frame.timestamp_s, T_cw, result.information)
             self.exposure = result.exposure
 
     def _prepared(self, frame: Frame) -> Frame:

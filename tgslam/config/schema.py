@@ -90,7 +90,7 @@ class TrackingConfig:
     weight_gradient: float = setting(0.3, 0.0, 100.0)
     correlated_px: float = setting(100.0, 1.0, 1e6)  # neighbouring pixels err alike: so many inform like one
     # What hands do within a frame, where pixels do not say: the last velocity, but for these standard deviations
-    acceleration_m: float = setting(2.0, 0.01, 1e4)  # m/s^2
+    acceleration_m: float = setting(5.0, 0.01, 1e4)  # m/s^2
     acceleration_rad: float = setting(20.0, 0.01, 1e4)  # rad/s^2
     speed_m: float = setting(1.0, 0.001, 1e3)  # m/s, while no velocity is known
     speed_rad: float = setting(2.0, 0.001, 1e3)  # rad/s

@@ -1,4 +1,4 @@
-"""Constant-velocity prediction of the next pose, and how far it can be trusted."""
+"""Where the camera will be at the next frame, and how far that can be trusted."""
 
 from __future__ import annotations
 
@@ -11,15 +11,24 @@ from tgslam.geometry import inverse, se3_exp, se3_log
 _LEAST_S = 1.0 / 120.0  # between frames whose timestamps say less
 
 
-class ConstantVelocity:
-    """Predicts T_cw by repeating the last motion, scaled by the time between frames."""
+class MotionFilter:
+    """Kalman filter of the camera's pose and velocity, which changes by accelerations that nothing foretells.
+
+    A velocity that is taken from the last two poses alone has all of their noise, and where nothing in view holds the
+    camera, it slides along with that. The state is T_cw and its left perturbation's velocity (rad/s, m/s). That the
+    perturbation's axes turn with the camera from a frame to the next is neglected in the covariances.
+    """
 
     def __init__(self, config: TrackingConfig) -> None:
-        self._config = config
+        self._acceleration = np.diag(np.array([config.acceleration_rad] * 3 + [config.acceleration_m] * 3) ** 2)
+        self._rest = np.diag(np.array([config.speed_rad] * 3 + [config.speed_m] * 3) ** 2)
         self._last: tuple[float, NDArray[np.float64]] | None = None
-        self._velocity = np.zeros(6)  # rad/s, m/s
-        self._known = False  # whether that was seen
         self._lost = False  # whether the last pose is only where the camera coasted to
+        self._velocity: NDArray[np.float64] = np.zeros(6)
+        # covariances [6, 6] of the last pose, of it with the velocity, and of that
+        self._poses: NDArray[np.float64] = np.zeros((6, 6))
+        self._crossed: NDArray[np.float64] = np.zeros((6, 6))
+        self._velocities: NDArray[np.float64] = self._rest
 
     def predict(self, timestamp_s: float) -> NDArray[np.float64]:
         """T_cw [4, 4] at that time."""
@@ -31,32 +40,52 @@ class ConstantVelocity:
     def information(self, timestamp_s: float) -> NDArray[np.float64]:
         """[6, 6] of the prediction's left perturbation: none before the first pose, and none while the camera is lost.
 
-        Cameras in hands and on robots do not jump: as much as they accelerate between frames is what is uncertain, and
-        all of the velocity while there is none.
+        Cameras in hands and on robots do not jump.
         """
         if self._last is None or self._lost:
             return np.zeros((6, 6))
-        elapsed_s = max(timestamp_s - self._last[0], _LEAST_S)
-        turn_rad = self._config.acceleration_rad * elapsed_s**2
-        shift_m = self._config.acceleration_m * elapsed_s**2
-        if not self._known:
-            turn_rad += self._config.speed_rad * elapsed_s
-            shift_m += self._config.speed_m * elapsed_s
-        return np.diag(np.array([turn_rad] * 3 + [shift_m] * 3) ** -2.0)
+        return np.linalg.inv(self._predicted(timestamp_s)[0])
 
-    def update(self, timestamp_s: float, T_cw: NDArray[np.float64]) -> None:
-        """Take in a tracked pose."""
-        if self._last is not None and timestamp_s > self._last[0]:
-            self._velocity = se3_log(T_cw @ inverse(self._last[1])) / (timestamp_s - self._last[0])
-            self._known = not self._lost
+    def update(self, timestamp_s: float, T_cw: NDArray[np.float64], information: NDArray[np.float64]) -> None:
+        """Take in the pose that a frame was tracked to, and what its images say of it: [6, 6] as in `TrackingResult`.
+
+        The pose is what images and prediction agree on: it enters as the state's, not as a measurement of it.
+        """
+        if self._lost:
+            self._start()
+        elif self._last is not None and timestamp_s > self._last[0]:
+            poses, crossed, velocities = self._predicted(timestamp_s)
+            prior = np.linalg.inv(poses)
+            gain = crossed.T @ prior
+            self._velocity = self._velocity + gain @ se3_log(T_cw @ inverse(self.predict(timestamp_s)))
+            self._poses = np.linalg.inv(prior + information)
+            self._crossed = self._poses @ gain.T
+            self._velocities = velocities - gain @ (poses - self._poses) @ gain.T
         self._last, self._lost = (timestamp_s, T_cw), False
+
+    def coast(self, timestamp_s: float, T_cw: NDArray[np.float64]) -> None:
+        """No pose was found: the camera may be at T_cw, and slows down, since its velocity soon tells little."""
+        self._last, self._lost = (timestamp_s, T_cw), True
+        self._velocity = self._velocity / 2.0
 
     def move(self, motion: NDArray[np.float64]) -> None:
         """The world around the camera has moved, p_w <- motion p_w [4, 4]; its velocity is as it was."""
         if self._last is not None:
             self._last = (self._last[0], self._last[1] @ inverse(motion))
 
-    def slow_down(self) -> None:
-        """Believe in half the velocity: where tracking is lost, the last one soon tells nothing."""
-        self._velocity = self._velocity / 2.0
-        self._lost = True
+    def _start(self) -> None:
+        """The next pose to come counts as known, its velocity as unknown."""
+        self._velocity = np.zeros(6)
+        self._poses, self._crossed, self._velocities = np.zeros((6, 6)), np.zeros((6, 6)), self._rest
+
+    def _predicted(self, timestamp_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """The covariances [6, 6] of pose, of pose and velocity, and of velocity at that time.
+
+        The velocity changes just after the last frame: were it by an acceleration that lasts, exact poses would have it
+        swing about the true one.
+        """
+        assert self._last is not None
+        dt = max(timestamp_s - self._last[0], _LEAST_S)
+        velocities = self._velocities + dt**2 * self._acceleration
+        crossed = self._crossed + dt * velocities
+        return self._poses + dt * (self._crossed + self._crossed.T) + dt**2 * velocities, crossed, velocities
