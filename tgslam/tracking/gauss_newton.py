@@ -31,6 +31,7 @@ from tgslam.types import Camera, Frame
 
 _CONVERGED = 1e-5  # rad and m: a smaller step ends a level
 _DAMPING = 1e-6  # of the normal matrix's trace
+_BACKED = 0.5  # of the frame's pixels with depth match a reference: it shows what the map does
 
 
 @dataclass
@@ -147,10 +148,12 @@ class GaussNewtonTracker:
         matches = [_Match.of(levels, reference, T_mw, exposure) for levels, reference in self._references]
         for level in reversed(range(len(live))):
             for _ in range(self.config.iterations[level]):
-                equations = self._linearise[level](live[level], model[level], T_ml, exposure)
+                others = [(self._of_reference(match, level, live[level], T_ml), match.T_rm) for match in matches]
+                backed = any(other.matched >= _BACKED * other.live_pixels for other, _ in others)
+                equations = self._linearise[level](live[level], model[level], T_ml, exposure, backed=backed)
                 exposure = fit_exposure(equations.intensity, self.config.exposure, exposure)
-                for match in matches:
-                    equations = equations.joined(self._of_reference(match, level, live[level], T_ml), match.T_rm)
+                for other, T_rm in others:
+                    equations = equations.joined(other, T_rm)
                 # a weak damping holds the directions that nothing observes
                 damping = _DAMPING * np.trace(equations.A) + 1e-9
                 drawn = prior / 4**level

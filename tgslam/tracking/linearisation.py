@@ -87,7 +87,7 @@ class Lineariser:
     """Evaluates Eqs. 12, 13 (without SSIM) between one resolution of a frame and of the model; holds the scratch."""
 
     def __init__(self, camera: Camera, config: TrackingConfig, loss: LossConfig) -> None:
-        self._sigma_colour = config.sigma_colour
+        self._config = config
         self._settings = np.zeros(alignment.SETTINGS, np.float32)
         for entry, value in {
             alignment.FX: camera.fx,
@@ -95,15 +95,12 @@ class Lineariser:
             alignment.CX: camera.cx,
             alignment.CY: camera.cy,
             alignment.DEPTH_SIGMA: loss.depth_sigma_per_m2,
-            alignment.SURFACE_SIGMA: config.surface_sigma_m,
             alignment.MAX_DISTANCE_SIGMAS: config.max_distance_sigmas,
             alignment.CHARBONNIER_DEPTH: loss.charbonnier_depth_sigmas,
             alignment.GATE_DEPTH_BOOST: loss.gate_depth_boost,
             alignment.SIGMA_COLOUR: config.sigma_colour,
             alignment.SIGMA_GRADIENT: config.sigma_gradient,
             alignment.WEIGHT_DEPTH: config.weight_depth,
-            alignment.WEIGHT_COLOUR: config.weight_colour,
-            alignment.WEIGHT_GRADIENT: config.weight_gradient,
         }.items():
             self._settings[entry] = value
         self._on_device = runtime.empty(self._settings.shape)
@@ -111,19 +108,29 @@ class Lineariser:
         self._kernels: _Kernels = _CudaKernels(camera) if on_cuda else _CpuKernels(camera)
 
     def __call__(
-        self, live: LiveLevel, model: ModelLevel, T_ml: NDArray[np.float64], exposure: Exposure
+        self,
+        live: LiveLevel,
+        model: ModelLevel,
+        T_ml: NDArray[np.float64],
+        exposure: Exposure,
+        *,
+        backed: bool = False,
     ) -> NormalEquations:
         """The equations at T_ml [4, 4] (live camera to model camera) and that exposure of the frame.
 
-        The unknowns are a left perturbation of T_ml.
+        The unknowns are a left perturbation of T_ml. backed: the model is a rendering, and references show the same.
         """
-        return self._unpacked(self._sums(live, model, T_ml, exposure))
+        return self._unpacked(self._sums(live, model, T_ml, exposure, backed))
 
     def _sums(
-        self, live: LiveLevel, model: ModelLevel, T_ml: NDArray[np.float64], exposure: Exposure
+        self, live: LiveLevel, model: ModelLevel, T_ml: NDArray[np.float64], exposure: Exposure, backed: bool
     ) -> NDArray[np.float64]:
         """The sums [SUMS] over all pixels, in the kernel's order."""
-        settings = self._settings
+        settings, config = self._settings, self._config
+        colour_share = config.splatted_colour if backed else 1.0
+        settings[alignment.SURFACE_SIGMA] = config.splatted_sigma_m if backed else config.surface_sigma_m
+        settings[alignment.WEIGHT_COLOUR] = colour_share * config.weight_colour
+        settings[alignment.WEIGHT_GRADIENT] = colour_share * config.weight_gradient
         settings[alignment.GAIN], settings[alignment.BIAS] = exposure.gain, exposure.bias
         settings[alignment.LIVE_SHARE] = 0.5 if model.measured else 0.0
         settings[alignment.GATE_LOW] = live.gate_low
@@ -145,6 +152,6 @@ class Lineariser:
             matched=named[alignment.MATCHED],
             inliers=named[alignment.INLIERS],
             depth_residual=named[alignment.DEPTH_SUM] / matched,
-            colour_residual=named[alignment.COLOUR_SUM] / matched * self._sigma_colour,
+            colour_residual=named[alignment.COLOUR_SUM] / matched * self._config.sigma_colour,
             intensity=IntensityMoments(*named[alignment.W : alignment.W_LM + 1]),
         )

@@ -44,7 +44,7 @@ class MotionFilter:
         """
         if self._last is None or self._lost:
             return np.zeros((6, 6))
-        return np.linalg.inv(self._predicted(timestamp_s)[0])
+        return np.asarray(np.linalg.inv(self._predicted(timestamp_s)[0]), np.float64)
 
     def update(self, timestamp_s: float, T_cw: NDArray[np.float64], information: NDArray[np.float64]) -> None:
         """Take in the pose that a frame was tracked to, and what its images say of it: [6, 6] as in `TrackingResult`.
@@ -58,7 +58,7 @@ class MotionFilter:
             prior = np.linalg.inv(poses)
             gain = crossed.T @ prior
             self._velocity = self._velocity + gain @ se3_log(T_cw @ inverse(self.predict(timestamp_s)))
-            self._poses = np.linalg.inv(prior + information)
+            self._poses = np.asarray(np.linalg.inv(prior + information), np.float64)
             self._crossed = self._poses @ gain.T
             self._velocities = velocities - gain @ (poses - self._poses) @ gain.T
         self._last, self._lost = (timestamp_s, T_cw), False
