@@ -194,6 +194,63 @@ def test_the_registry_keeps_a_board_and_its_wall_apart() -> None:
     assert np.degrees(np.arccos(min(normal @ registry.instances[wall].normal_w, 1.0))) < 0.3
 
 
+FAR = looking((0.2, -2.0, 1.2), (0.2, 2.0, 0.7))  # 4 m off: the noise is larger than the step, the board 5 px wide
+
+
+def told_of_a_board() -> PlaneRegistry:
+    """A registry that knows a board on a wall from nearby."""
+    registry = PlaneRegistry(CONFIG, DEPTH_SIGMA_PER_M2)
+    for keyframe, T_cw in enumerate(ALONG[::2]):
+        depth_m, _ = measured([WALL, BOARD], T_cw, keyframe)
+        registry.observe(seen(depth_m), depth_m, CAMERA, T_cw, keyframe)
+    return registry
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_far_view_shows_a_board_that_it_could_not_tell_by_itself(seed: int) -> None:
+    depth_m, labels = measured([WALL, BOARD], FAR, seed)
+    alone = seen(depth_m)
+    assert of_board(alone, labels) == 0
+    registry = told_of_a_board()
+    view = registry.with_known_steps(alone, depth_m, CAMERA, FAR)
+    assert len(view.segments) == len(alone.segments) + 1
+    part, found, board = view.segments[-1], view.labels == len(alone.segments), labels == 1
+    assert np.mean(board[found]) > 0.7  # its window takes in a row of the wall
+    known = np.abs(points_c(CAMERA, depth_m)[..., 0]) < 1.2
+    assert np.mean(found[board & known]) > 0.7
+    np.testing.assert_array_equal(view.labels[~found], alone.labels[~found])
+    assert part.area_px == found.sum()
+    assert part.area_px + view.segments[0].area_px == alone.segments[0].area_px
+    assert part.offset_m < view.segments[0].offset_m - 0.007
+    assert abs(part.normal_c @ part.centroid_c + part.offset_m) < 0.001
+    assert not part.reliable
+    observed = registry.observe(view, depth_m, CAMERA, FAR, 9)
+    (parted,) = registry.parted_from(int(observed.ids[0]))
+    assert observed.ids[-1] == parted.id
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_bare_wall_shows_no_board_where_there_was_one(seed: int) -> None:
+    depth_m, _ = measured([WALL], FAR, seed)
+    alone = seen(depth_m)
+    assert told_of_a_board().with_known_steps(alone, depth_m, CAMERA, FAR) is alone
+
+
+@pytest.mark.parametrize("target", [(0.2, -6.0, 0.7), (6.0, -2.0, 0.7)])
+def test_a_view_elsewhere_is_left_as_it_is(target: tuple[float, float, float]) -> None:
+    T_cw = looking((0.2, -2.0, 1.2), target)
+    depth_m, _ = measured([Rectangle(target, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (3.0, 6.0))], T_cw)
+    alone = seen(depth_m)
+    assert told_of_a_board().with_known_steps(alone, depth_m, CAMERA, T_cw) is alone
+
+
+def test_a_view_that_tells_the_board_itself_is_left_as_it_is() -> None:
+    depth_m, labels = measured([WALL, BOARD], ALONG[3], 5)
+    alone = seen(depth_m)
+    assert of_board(alone, labels) > 0
+    assert told_of_a_board().with_known_steps(alone, depth_m, CAMERA, ALONG[3]) is alone
+
+
 def test_keyframes_before_a_plane_was_confirmed_show_it_too() -> None:
     mapping, keyframes = PlanarMapping(CAMERA, CONFIG, DEPTH_SIGMA_PER_M2), []
     masks = []

@@ -333,6 +333,17 @@ def test_an_ambiguous_segment_that_comes_again_is_a_plane_from_its_first_keyfram
     assert stage.registry.instances[plane_id].keyframes == [0, 1, 2]
 
 
+@pytest.mark.parametrize(("turn_deg", "views"), [(0.0, 2), (12.0, 3)])
+def test_what_stands_as_a_wall_needs_one_view_less(turn_deg: float, views: int) -> None:
+    turn = np.deg2rad(turn_deg)
+    along = (-np.sin(turn), np.cos(turn), 0.0)  # seen from the other side than SIDE is, to which it may be parallel
+    post = Rectangle((0.2, 2.2, 1.2), along, (0, 0, 1), (0.4, 0.8))
+    stage = Stage([WALL, FLOOR, SIDE, post], PlanesConfig(confirm_views=3))
+    poses = [looking((x, 0.3, 1.4), (1.4, 3.0, 1.2)) for x in (0.9, 0.95, 1.0)]
+    found = [stage.show(T_cw, unreliable=(3,)) for T_cw in poses]
+    assert [ids[3][0] >= 0 for _, ids in found] == [view + 1 >= views for view in range(3)]
+
+
 def test_a_reliable_view_confirms_an_ambiguous_segment() -> None:
     stage = Stage([WALL, FLOOR])
     stage.show(HERE, unreliable=(0,))

@@ -215,7 +215,7 @@ class PlanesConfig:
     bias_per_m2: float = setting(0.0007, 0.0, 1.0)  # a sensor bends surfaces at depth z by this * z^2, 1/m
     independent_views: int = setting(10, 1, 100_000)  # however many there are, they inform no more than so many
     observations: int = setting(256, 8, 100_000)  # kept of each PGI
-    confirm_views: int = setting(3, 2, 1000)  # views that make an ambiguous segment a PGI
+    confirm_views: int = setting(3, 2, 1000)  # of an ambiguous segment make it a PGI; one less if parallel to a wall
     candidate_keyframes: int = setting(10, 1, 100_000)  # in which it is not confirmed drop it
     through_share: float = setting(0.6, 0.1, 1.0)  # of a PGI seen through in a view speaks against it
     through_keyframes: int = setting(3, 1, 1000)  # that speak against a PGI, one after the other, remove it

@@ -82,6 +82,7 @@ class PlanarMapping:
         self._T_cw.append(keyframe.T_cw.copy())
         depth_m = keyframe.depth_m()
         view = extract_planes(runtime.to_device(depth_m), self.camera, self.config, self.sigma_per_m2)
+        view = self.registry.with_known_steps(view, depth_m, self.camera, keyframe.T_cw)
         observation = self.registry.observe(view, depth_m, self.camera, keyframe.T_cw, number)
         for earlier in keyframes[:-1]:
             self._correct(earlier, observation.corrected)

@@ -48,6 +48,15 @@ class Joining:
         """Whether a step has parted two instances in a view."""
         return frozenset((a, b)) in self._steps
 
+    def steps(self) -> list[Pair]:
+        """(smaller, larger) instances that a step has parted in a view, in the order in which they were."""
+        pairs = [_by_extent(*pair) for pair in self._steps]  # of equals, a set's order would tell them apart
+        return [(small, large) for large, small in pairs if len(small.support) < len(large.support)]
+
+    def has_step(self, instance: PlanarInstance) -> bool:
+        """Whether a step has parted an instance from any other one in a view."""
+        return any(instance in pair for pair in self._steps)
+
     def parted_from(self, instance: PlanarInstance) -> list[PlanarInstance]:
         """The instances that a view has parted from one."""
         return [other for pair in self._apart if instance in pair for other in pair if other is not instance]

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 from tgslam.config.schema import PlanesConfig
 from tgslam.geometry import inverse
+from tgslam.planes.directions import stands_as_known
 from tgslam.planes.estimate import PlaneEstimate
 from tgslam.planes.instance import NO_ID, PlanarInstance, Poses
 from tgslam.planes.joining import Joining
+from tgslam.planes.known_steps import with_known_steps
 from tgslam.planes.matching import LEAST_SAMPLES, ViewMatching
 from tgslam.planes.segment import PlaneView
 from tgslam.planes.sight import Samples, Sight, Tolerance
@@ -85,6 +87,16 @@ class PlaneRegistry:
         if plane_id not in known:
             return []
         return [other for other in self._joining.parted_from(known[plane_id]) if other.id in known]
+
+    def with_known_steps(
+        self, view: PlaneView, depth_m: FloatImage, camera: Camera, T_cw: NDArray[np.float64]
+    ) -> PlaneView:
+        """A keyframe's planes, and those that it shows where others have told a step; arguments as of `observe`."""
+        alive = [pair for pair in self._joining.steps() if all(instance in self._instances for instance in pair)]
+        if not alive:
+            return view
+        samples = Samples.of(view, depth_m, camera, T_cw, self._config.mask_width_px)
+        return with_known_steps(samples, alive, self._config, self._tolerance.sensor_per_m2)
 
     def observe(
         self, view: PlaneView, depth_m: FloatImage, camera: Camera, T_cw: NDArray[np.float64], keyframe: int
@@ -180,13 +192,21 @@ class PlaneRegistry:
         created = []
         for instance in seen:
             reliable = any(matching.segments[piece].reliable for piece in matching.pieces(instance))
-            if instance.id == NO_ID and (reliable or len(instance.keyframes) >= self._config.confirm_views):
+            if instance.id == NO_ID and (reliable or len(instance.keyframes) >= self._needed_views(instance)):
                 created.append(self._name(instance))
         for instance in self._instances:
             instance.unseen += instance not in seen
         limit = self._config.candidate_keyframes
         self._instances = [i for i in self._instances if i.id != NO_ID or i.unseen <= limit]
         return created
+
+    def _needed_views(self, candidate: PlanarInstance) -> int:
+        """Views that make a candidate a PGI: one less where how it stands speaks for it.
+
+        What a step parts from another surface has its normal from that, which tells nothing.
+        """
+        measured = not self._joining.has_step(candidate)
+        return self._config.confirm_views - (measured and stands_as_known(candidate, self._instances, self._config))
 
     def _weigh_contradictions(self, matching: ViewMatching, seen: list[PlanarInstance]) -> list[int]:
         """Take back what the view sees through; the ids of PGIs of which nothing is left, or no view speaks for."""

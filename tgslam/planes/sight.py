@@ -21,6 +21,7 @@ _GRAZING_COSINE = 0.05  # rays flatter than this say nothing of where they meet 
 _LEAST_THROUGH, _THROUGH_SHARE = 3, 0.1  # of the places in a gap: fewer are noise
 _CLOSE_M, _FILLED_SHARE = 0.15, 0.5  # before a plane; of the places in a gap that do not show the plane
 _STEP_M = 0.01  # between the places at which a gap is looked at
+_MARGIN_PX = 8
 _MAX_FOOTPRINT_CELLS = 1 << 20  # a degenerate segment does not make the grid explode
 
 
@@ -65,6 +66,26 @@ class Samples:
         """[K, 3] m: the samples of one segment in the world."""
         chosen = self.label == segment
         return transform_points(inverse(self.T_cw), self.rays[chosen] * self.z_m[chosen, None])
+
+    def points(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Vector:
+        """[3, N] m, camera frame: of pixels [N], all of which are measured."""
+        z, camera = self.depth_m[rows, columns].astype(np.float64), self.camera
+        return np.stack([(columns - camera.cx) / camera.fx * z, (rows - camera.cy) / camera.fy * z, z])
+
+    def window(self, points_w: Vector) -> tuple[slice, slice]:
+        """Rows and columns between which the convex hull of points [N, 3] m appears, and a margin of a few pixels."""
+        x, y, z = transform_points(self.T_cw, points_w).T
+        camera, sides = self.camera, []
+        for along, focal, centre, size in (
+            (y, camera.fy, camera.cy, camera.height),
+            (x, camera.fx, camera.cx, camera.width),
+        ):
+            low, high = 0, size
+            if z.min() > _NEAREST_M:
+                at = focal * along / z + centre
+                low, high = (int(np.clip(i, 0, size)) for i in (at.min() - _MARGIN_PX, at.max() + _MARGIN_PX + 1))
+            sides.append(slice(low, high))
+        return sides[0], sides[1]
 
     def pixels(self, points_w: Vector) -> tuple[NDArray[np.int64], NDArray[np.int64], Vector, NDArray[np.bool_]]:
         """Where points [N, 3] m appear: columns, rows (0 outside), depths z in m, and whether they are in the image."""
