@@ -84,9 +84,7 @@ class TrackingConfig:
     renders: int = setting(1, 1, 5)  # the map is rendered this often at the latest estimate
     sigma_colour: float = setting(0.05, 1e-4, 1.0)  # intensity residual of weight 1
     sigma_gradient: float = setting(0.02, 1e-4, 1.0)  # gradient residual of weight 1, 1/px
-    surface_sigma_m: float = setting(
-        0.005, 0.0, 1.0
-    )  # by which surfaces stray from where they are, beyond sensor noise
+    surface_sigma_m: float = setting(0.005, 0.0, 1.0)  # what surfaces err by beyond the sensor's noise
     # Of the map where references show the same: renderings err alike over the whole image, slopes most of all, and draw
     # the camera with a certainty that grows with the pixels
     splatted_sigma_m: float = setting(0.05, 0.0, 10.0)  # takes the place of surface_sigma_m
