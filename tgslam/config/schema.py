@@ -133,7 +133,7 @@ class SeedingConfig:
     plane_cells_across: int = setting(40, 1, 10_000)  # likewise on one plane (PGI)
     plain_colour_std: float = setting(0.015, 0.0, 1.0)  # a cell whose channels vary less has no texture
     plane_colour_std: float = setting(0.022, 0.0, 1.0)  # likewise for a cell on one plane, but for a linear trend
-    planar_sigmas: float = setting(2.0, 0.0, 100.0)  # a cell whose plane residual is less, in sensor sigmas, is flat
+    planar_sigmas: float = setting(2.5, 0.0, 100.0)  # a cell whose plane residual is less, in sensor sigmas, is flat
     overlap: float = setting(0.6, 0.1, 3.0)  # standard deviation of a Gaussian in cell sizes
     thickness: float = setting(0.1, 1e-3, 1.0)  # standard deviation along the normal, relative to across
     opacity: float = setting(0.9, 0.01, 0.99)
@@ -241,7 +241,7 @@ class StructureConfig:
     read_distance_m: float = setting(0.05, 0.0, 10.0)  # and the rendered surface is at most this far from the plane
     read_sigmas: float = setting(3.0, 0.0, 100.0)  # and so many standard deviations of the sensor's depth, and adjoins
     read_margin_m: float = setting(0.05, 0.001, 10.0)  # what lies no farther than this beyond where the plane was seen
-    lambda_str: float = setting(0.05, 0.0, 100.0)  # what E_str weighs; 0 = no regularisers
+    lambda_str: float = setting(0.08, 0.0, 100.0)  # what E_str weighs; 0 = no regularisers
     omega_flat: float = setting(1.0, 0.0, 100.0)  # of Eq. 8, scales relative to sqrt(s1 s2)
     omega_normal: float = setting(0.3, 0.0, 100.0)  # of Eq. 9
     omega_distance: float = setting(0.4, 0.0, 100.0)  # of the distance to the plane
