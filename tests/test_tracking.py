@@ -333,31 +333,37 @@ class Farther(Planes):
         return RenderImages(*(runtime.to_device(image) for image in images))
 
 
-def forward_m(config: TrackingConfig, poses: list[np.ndarray]) -> float:
-    """By how much a map that is too far off draws the camera, beside exact keyframes at those poses."""
+def forward_m(config: TrackingConfig, *keyframes: tuple[np.ndarray, float]) -> float:
+    """By how much the camera is drawn ahead beside keyframes at those poses, whose depth is too far by so many m."""
     scene = Farther((WALL, SIDE, FLOOR), camera=LARGE)
-    keyframes = [Reference(f.colour, f.depth_m, T, Exposure()) for f, T in ((scene.frame(T), T) for T in poses)]
+    references = [
+        Reference(frame.colour, frame.depth_m + np.float32(off_m), T_cw, Exposure())
+        for frame, T_cw, off_m in ((scene.frame(T_cw), T_cw, off_m) for T_cw, off_m in keyframes)
+    ]
     tracker = exact_tracker(scene, replace(config, weight_colour=0.0, weight_gradient=0.0))
-    tracker.know(NO_PLANES, keyframes)
+    tracker.know(NO_PLANES, references)
     return float((MOTION @ inverse(tracker.track(scene.frame(MOTION), None, np.eye(4), Exposure()).T_cw))[2, 3])
 
 
 NEARBY = [se3_exp([0.01, -0.02, 0.005, -0.02, 0.01, 0.03]), se3_exp([-0.01, 0.01, 0.0, 0.015, 0.0, -0.02]), MOTION]
 
 
-def test_keyframes_as_they_were_measured_count_as_much_as_a_map_without_faults_of_its_own():
-    """Of three that are aligned to, two exact ones leave a third of the map's pull; more are given than are used."""
-    config = replace(CONFIG, references=2, splatted_sigma_m=CONFIG.surface_sigma_m)
-    drawn_m = [forward_m(config, NEARBY[:count]) for count in range(4)]
-    assert drawn_m[0] == pytest.approx(Farther.OFF_M, rel=0.2)
-    np.testing.assert_allclose(drawn_m, drawn_m[0] / np.array([1, 2, 3, 3]), rtol=0.05)
+def test_keyframes_count_alike_as_many_as_are_used():
+    """Of two that are aligned to, an exact one leaves half of the other's pull; more are given than are used."""
+    first, second, third = NEARBY
+    off = forward_m(CONFIG, (first, Farther.OFF_M))
+    assert off == pytest.approx(Farther.OFF_M, rel=0.2)
+    both = replace(CONFIG, references=2)
+    assert forward_m(both, (first, Farther.OFF_M), (second, 0.0)) == pytest.approx(off / 2, rel=0.05)
+    exact = forward_m(both, (first, 0.0), (second, 0.0), (third, Farther.OFF_M))
+    assert exact == forward_m(both, (first, 0.0), (second, 0.0))
 
 
-def test_the_map_counts_little_where_keyframes_show_the_same_and_as_ever_where_they_do_not():
-    alone_m, away = forward_m(CONFIG, []), se3_exp([0.0, 1.2, 0.0, 0.0, 0.0, 0.0])
-    assert 0.0 < forward_m(CONFIG, NEARBY[:1]) < 0.1 * alone_m
-    lonely = [forward_m(replace(CONFIG, splatted_sigma_m=sigma_m), [away]) for sigma_m in (0.005, 0.05)]
-    assert lonely[0] == lonely[1] > 0.3 * alone_m
+def test_the_maps_depth_counts_only_where_no_keyframe_shows_the_same():
+    alone_m, away = forward_m(CONFIG), se3_exp([0.0, 1.2, 0.0, 0.0, 0.0, 0.0])
+    assert alone_m == pytest.approx(Farther.OFF_M, rel=0.2)
+    assert forward_m(CONFIG, (NEARBY[0], 0.0)) == pytest.approx(0.0, abs=2e-5)
+    assert forward_m(CONFIG, (away, 0.0)) > 0.3 * alone_m
 
 
 def poses_at(*camera: tuple[float, float]) -> np.ndarray:

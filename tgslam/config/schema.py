@@ -86,8 +86,7 @@ class TrackingConfig:
     sigma_gradient: float = setting(0.02, 1e-4, 1.0)  # gradient residual of weight 1, 1/px
     surface_sigma_m: float = setting(0.005, 0.0, 1.0)  # what surfaces err by beyond the sensor's noise
     # Of the map where references show the same: renderings err alike over the whole image, slopes most of all, and draw
-    # the camera with a certainty that grows with the pixels
-    splatted_sigma_m: float = setting(0.05, 0.0, 10.0)  # takes the place of surface_sigma_m
+    # the camera with a certainty that grows with the pixels. Their depth does not count there at all
     splatted_colour: float = setting(0.2, 0.0, 1.0)  # of the weights of colour and gradient
     weight_depth: float = setting(1.0, 0.0, 100.0)
     weight_colour: float = setting(0.3, 0.0, 100.0)

@@ -100,7 +100,7 @@ class Lineariser:
             alignment.GATE_DEPTH_BOOST: loss.gate_depth_boost,
             alignment.SIGMA_COLOUR: config.sigma_colour,
             alignment.SIGMA_GRADIENT: config.sigma_gradient,
-            alignment.WEIGHT_DEPTH: config.weight_depth,
+            alignment.SURFACE_SIGMA: config.surface_sigma_m,
         }.items():
             self._settings[entry] = value
         self._on_device = runtime.empty(self._settings.shape)
@@ -128,7 +128,7 @@ class Lineariser:
         """The sums [SUMS] over all pixels, in the kernel's order."""
         settings, config = self._settings, self._config
         colour_share = config.splatted_colour if backed else 1.0
-        settings[alignment.SURFACE_SIGMA] = config.splatted_sigma_m if backed else config.surface_sigma_m
+        settings[alignment.WEIGHT_DEPTH] = 0.0 if backed else config.weight_depth
         settings[alignment.WEIGHT_COLOUR] = colour_share * config.weight_colour
         settings[alignment.WEIGHT_GRADIENT] = colour_share * config.weight_gradient
         settings[alignment.GAIN], settings[alignment.BIAS] = exposure.gain, exposure.bias
