@@ -68,7 +68,7 @@ TEXTURE = 8
 _INLIER_SIGMAS = 3.0
 _MIN_COSINE = 0.2  # grazing rays: the noise across the surface is taken to be no less than this share of that along z
 _NEAR_M = 0.05
-MIN_DEPTH_M = 1e-3  # keeps what does not count finite
+_MIN_DEPTH_M = 1e-3  # keeps what does not count finite
 _LANE = tuple(float(j) for j in range(LANES))
 _PART_STEP = 128  # a loop over parts counts in steps of this, since Taichi hands a thread 512 iterations at a time
 
@@ -184,7 +184,6 @@ def add_residuals(
     settings: ti.template(),
     ray_x,  # of the live pixel
     ray_y,
-    depth,
     live,
     live_gx,
     live_gy,
@@ -218,7 +217,7 @@ def add_residuals(
     # by the model's depth: by the measured one, what errs towards the camera would count for more. Of a model that errs
     # as much, by the mean of both
     share = settings[LIVE_SHARE]
-    expected = larger(share * z + (1.0 - share) * model_depth, filled(z, MIN_DEPTH_M))
+    expected = larger(share * z + (1.0 - share) * model_depth, filled(z, _MIN_DEPTH_M))
     sensor = settings[DEPTH_SIGMA] * expected * expected
     has_normal = indicator(filled(z, 0.5), nx * nx + ny * ny + nz * nz)
     length = ti.sqrt(ray_x * ray_x + ray_y * ray_y + 1.0)
@@ -332,7 +331,7 @@ def add_16_pixels(
         t = bilinear(texture, u_cell, v_cell, um[j] - ti.cast(u_cell, ti.f32), vm[j] - ti.cast(v_cell, ti.f32))
         grey[j], gx[j], gy[j], gxx[j], gxy[j], gyy[j] = t[GREY], t[GX], t[GY], t[GXX], t[GXY], t[GYY]
     add_residuals(
-        settings, ray_x, ray_y, larger(depth, filled(depth, MIN_DEPTH_M)),
+        settings, ray_x, ray_y,
         live[v, block, LIVE_GREY], live[v, block, LIVE_GX], live[v, block, LIVE_GY], live[v, block, LIVE_STRENGTH],
         x, y, z, seen, nx, ny, nz, model_depth, near_u, near_v,
         grey, gx, gy, gxx, gxy, gyy, sums, row,

@@ -39,7 +39,7 @@ class Planes:
     def resolve(self, plane_id: int) -> int:
         return self.renamed.get(plane_id, plane_id)
 
-    def seen_from(self, keyframe: int) -> dict:
+    def seen_from(self, keyframe: int, surface_sigma_m: float = 0.0) -> dict:
         return {self.resolve(i): view for i, view in self.views.get(keyframe, {}).items()}
 
     @property
@@ -48,7 +48,7 @@ class Planes:
         return {
             i: SimpleNamespace(
                 keyframes=[k for k in self.views if i in self.seen_from(k)],
-                view=lambda k, i=i: self.seen_from(k).get(i),
+                view=lambda k, surface_sigma_m=0.0, i=i: self.seen_from(k).get(i),
                 split_from=self if i in self.split else None,
             )
             for i in ids

@@ -446,6 +446,19 @@ def test_many_views_take_bounded_memory() -> None:
     assert max(np.diff(kept)) <= 8
 
 
+def test_a_view_is_as_certain_as_the_sensor_and_the_surface_that_is_asked_for() -> None:
+    stage = Stage([WALL, FLOOR])
+    _, ids = stage.show(HERE)
+    wall = stage.registry.instances[ids[0][0]]
+    exact, rough, as_set = wall.view(0, 0.0), wall.view(0, 0.01), wall.view(0)
+    assert exact and rough and as_set
+    assert_allclose(rough.covariance[2, 2] - exact.covariance[2, 2], 0.01**2, rtol=1e-9)
+    assert_allclose(as_set.covariance, wall.view(0, PlanesConfig().model_sigma_m).covariance)
+    assert exact.covariance[2, 2] < 0.001**2  # thousands of pixels: the sensor's noise averages out
+    assert_allclose(exact.normal, rough.normal)
+    assert stage.registry.seen_from(0, 0.01)[wall.id].covariance[2, 2] == rough.covariance[2, 2]
+
+
 def test_a_view_without_planes_changes_nothing() -> None:
     stage = Stage([WALL, FLOOR])
     _, ids = stage.show(HERE)

@@ -249,7 +249,7 @@ class PoseGraph:
 
     def _plane_factor(self, sighting: _Sighting) -> gtsam.CustomFactor:
         keys = _pose(sighting.keyframe), _landmark(sighting.plane_id)
-        noise = self._robust(gtsam.noiseModel.Isotropic.Sigma(3, self._config.landmark_inflation))
+        noise = self._robust(gtsam.noiseModel.Unit.Create(3))
         return gtsam.CustomFactor(noise, list(keys), _PlaneError(keys, sighting.plane))
 
     def _robust(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:

@@ -18,7 +18,6 @@ from tgslam.kernels.alignment import (
     LIVE_GY,
     LIVE_PIXELS,
     LIVE_STRENGTH,
-    MIN_DEPTH_M,
     MODEL_DEPTH,
     SMALLEST,
     SUMS,
@@ -72,7 +71,7 @@ def add_pixel(
             uc, vc = ti.cast(um, ti.i32), ti.cast(vm, ti.i32)
             fx, fy = um - ti.cast(uc, ti.f32), vm - ti.cast(vc, ti.f32)
             add_residuals(
-                settings, ray_x, ray_y, ti.max(depth, MIN_DEPTH_M),
+                settings, ray_x, ray_y,
                 live[v, block, LIVE_GREY, lane], live[v, block, LIVE_GX, lane], live[v, block, LIVE_GY, lane],
                 live[v, block, LIVE_STRENGTH, lane], x, y, z, seen,
                 surface[vn, un, 0], surface[vn, un, 1], surface[vn, un, 2], surface[vn, un, MODEL_DEPTH],

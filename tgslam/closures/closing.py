@@ -90,17 +90,17 @@ class GraphClosing:
 
     def _add_sightings(self, planes: PlaneRegistry) -> None:
         """What is new; everything anew where PGIs have merged, split or ended."""
-        instances = planes.instances
+        instances, surface_m = planes.instances, self._config.surface_sigma_m
         gone = self._sighted.keys() - instances.keys()
         split = any(i.split_from is not None for k, i in instances.items() if k not in self._sighted)
         if gone or split:
             self._sighted = {plane_id: set(instance.keyframes) for plane_id, instance in instances.items()}
-            self._graph.replace_planes({k: planes.seen_from(k) for k in range(len(self._applied))})
+            self._graph.replace_planes({k: planes.seen_from(k, surface_m) for k in range(len(self._applied))})
             return
         for plane_id, instance in instances.items():
             known = self._sighted.setdefault(plane_id, set())
             for keyframe in instance.keyframes:
-                view = None if keyframe in known else instance.view(keyframe)
+                view = None if keyframe in known else instance.view(keyframe, surface_m)
                 if view is not None:
                     self._graph.add_plane_observation(keyframe, plane_id, view)
             known.update(instance.keyframes)

@@ -253,7 +253,7 @@ class ClosureConfig:
     """The pose graph over keyframes, and what planes seen again say to it (sections 3.3, 3.4)."""
 
     enabled: bool = setting(False)  # False: keyframes stay where tracking has put them
-    formulation: str = setting("both", choices=("closures", "landmarks", "both"))  # edges, planes as variables
+    formulation: str = setting("landmarks", choices=("closures", "landmarks", "both"))  # edges, planes as variables
     solver: str = setting("incremental", choices=("incremental", "batch"))  # iSAM2, Levenberg-Marquardt
     # A step's error beyond what tracking's residuals show
     odometry_sigma_rad: float = setting(0.0002, 1e-7, 1.0)
@@ -263,8 +263,9 @@ class ClosureConfig:
     least_turn_rad: float = setting(0.001, 0.0, 1.0)
     robust: str = setting("cauchy", choices=("none", "huber", "cauchy", "dcs"))  # noise of closures and planes
     robust_sigmas: float = setting(3.0, 0.1, 1000.0)  # beyond which an error counts less
-    # A landmark's views count as this much less certain: where the surface strays from its plane, they all err alike
-    landmark_inflation: float = setting(2.0, 1.0, 100.0)
+    # Landmarks: by what a surface strays from its plane in one view and not in others. Most of it all views see alike:
+    # that shifts the plane, and no keyframe
+    surface_sigma_m: float = setting(0.0003, 1e-5, 1.0)
     relinearise: float = setting(0.01, 0.0, 1.0)  # rad and m; with solver: incremental
     # Structure closures: which keyframes are compared, and what of it becomes an edge
     interval: int = setting(4, 1, 1000)  # k of Table 4: at every k-th keyframe

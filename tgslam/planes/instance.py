@@ -41,7 +41,7 @@ class PlanarInstance:
         self.taken_by: PlanarInstance | None = None  # to which the latest keyframe to show it has counted it instead
         self.taken = 0  # such keyframes, one after the other
         self._config = config
-        self._views: PlaneEstimate | None = None  # [N] each in its keyframe's camera
+        self._views: PlaneEstimate | None = None  # [N] each in its keyframe's camera, but for the surface's error
         self._view_keyframes: NDArray[np.int64] = np.zeros(0, np.int64)
         self._view_areas: Vector = np.zeros(0)  # m2
         self._view_rms_m: Vector = np.zeros(0)
@@ -85,15 +85,21 @@ class PlanarInstance:
         """Outlines [K, 3] m of its extent, world, largest first, counter-clockwise seen from its front."""
         return self.support.polygons()
 
-    def view(self, keyframe: int) -> PlaneEstimate | None:
-        """The plane as that keyframe saw it, in its camera's frame; None where it did not or is no longer known."""
+    def view(self, keyframe: int, surface_sigma_m: float | None = None) -> PlaneEstimate | None:
+        """The plane as that keyframe saw it, in its camera's frame; None where it did not or is no longer known.
+
+        surface_sigma_m: by what the surface strays from its plane, None = as the settings say. Views that are held
+        against each other take less: much of it they see alike.
+        """
         index = np.flatnonzero(self._view_keyframes == keyframe)
         if self._views is None or len(index) == 0:
             return None
-        return self._views[int(index[0])] if len(index) == 1 else fuse(self._views[index])
+        sigma_m = self._config.model_sigma_m if surface_sigma_m is None else surface_sigma_m
+        views = self._views[index].with_surface_error(self._view_areas[index], sigma_m)
+        return views[0] if len(index) == 1 else fuse(views)
 
     def add_view(self, keyframe: int, local: PlaneEstimate, area_m2: float, rms_m: float, poses: Poses) -> None:
-        """A plane in a keyframe's camera frame is this one. Refits the plane."""
+        """A plane in a keyframe's camera frame, as certain as the sensor's noise leaves it, is this one. Refits."""
         self._take(
             PlaneEstimate(*(np.asarray(part)[None] for part in vars(local).values())),
             np.array([keyframe]),
@@ -118,7 +124,8 @@ class PlanarInstance:
         """The plane that all views agree on, at the poses that their keyframes have now."""
         assert self._views is not None
         T_wc = np.stack([poses[int(k)] for k in self._view_keyframes])
-        bent = self._views.with_sensor_bias(self._view_areas, self._config.bias_per_m2)
+        rough = self._views.with_surface_error(self._view_areas, self._config.model_sigma_m)
+        bent = rough.with_sensor_bias(self._view_areas, self._config.bias_per_m2)
         world = bent.with_pose_error(self._config.pose_sigma_rad, self._config.pose_sigma_m).transformed(T_wc)
         self.plane = fuse(world, self._config.independent_views)
         self.latest = bent[-1].transformed(T_wc[-1])

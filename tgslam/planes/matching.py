@@ -47,8 +47,10 @@ class ViewMatching:
         self.samples, self.config, self.tolerance = samples, config, tolerance
         self.instances = list(instances)
         self.segments = samples.view.segments
-        self.local = from_segments(self.segments).with_surface_error(self._areas_m2(), config.model_sigma_m)
-        self.local.covariance[[not s.reliable for s in self.segments]] *= _DEFERRED_VARIANCE
+        self._measured = from_segments(self.segments)
+        self.local = self._measured.with_surface_error(self._areas_m2(), config.model_sigma_m)
+        for planes in (self._measured, self.local):
+            planes.covariance[[not s.reliable for s in self.segments]] *= _DEFERRED_VARIANCE
         misfit = deviation_sigmas(self.local[:, None], self.local[None])
         self._misfit_sigmas = np.maximum(misfit, misfit.T)  # [S, S] of each segment and each other one
         self.owner: list[PlanarInstance | None] = [None] * len(self.segments)
@@ -148,10 +150,12 @@ class ViewMatching:
         return [segment for segment, owner in enumerate(self.owner) if owner is instance]
 
     def combined(self, pieces: list[int]) -> tuple[PlaneEstimate, float, float]:
-        """One plane from several segments: in the camera's frame, with its area in m2 and RMS in m."""
+        """One plane from several segments: in the camera's frame, as certain as the sensor's noise leaves it, with its
+        area in m2 and RMS in m.
+        """
         areas = self._areas_m2()[pieces]
         rms_m = np.array([self.segments[piece].rms_m for piece in pieces])
-        plane = self.local[pieces[0]] if len(pieces) == 1 else fuse(self.local[pieces])
+        plane = self._measured[pieces[0]] if len(pieces) == 1 else fuse(self._measured[pieces])
         return plane, float(areas.sum()), float(np.sqrt(areas @ rms_m**2 / max(areas.sum(), 1e-12)))
 
     def _bent(self) -> PlaneEstimate:

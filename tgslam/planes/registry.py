@@ -76,9 +76,10 @@ class PlaneRegistry:
             plane_id = self._absorbed_by[plane_id]
         return plane_id if any(instance.id == plane_id for instance in self._instances) else NO_ID
 
-    def seen_from(self, keyframe: int) -> dict[int, PlaneEstimate]:
-        """The PGIs that a keyframe saw, by id, each as it saw it: in its camera's frame."""
-        views = {i: instance.view(keyframe) for i, instance in self.instances.items() if keyframe in instance.keyframes}
+    def seen_from(self, keyframe: int, surface_sigma_m: float | None = None) -> dict[int, PlaneEstimate]:
+        """The PGIs that a keyframe saw, by id, each as it saw it: `PlanarInstance.view`."""
+        seen = {i: instance for i, instance in self.instances.items() if keyframe in instance.keyframes}
+        views = {i: instance.view(keyframe, surface_sigma_m) for i, instance in seen.items()}
         return {i: view for i, view in views.items() if view is not None}
 
     def parted_from(self, plane_id: int) -> list[PlanarInstance]:
