@@ -16,7 +16,7 @@ _LINES = (  # label, key, format
     ("planes", "planes", "{:d}"),
     ("plane area", "plane_area_m2", "{:.1f} m2"),
     ("plane residual, RMS", "plane_rms_mm", "{:.1f} mm"),
-    ("closures", "closures", "{:d}"),
+    ("closures", "closure edges", "{:d}"),
     ("ATE, keyframes", "ate_rmse_cm", "{:.2f} cm"),
     ("ATE, all frames", "ate_rmse_all_cm", "{:.2f} cm"),
     ("RPE, translation", "rpe_trans_cm", "{:.3f} cm"),
