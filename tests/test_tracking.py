@@ -270,6 +270,7 @@ class Planes:
             n_c = T_cw[:3, :3] @ np.array(normal) / np.linalg.norm(normal)
             depth = -(offset / np.linalg.norm(normal) - n_c @ T_cw[:3, 3]) / (rays @ n_c)
             z = np.minimum(z, np.where(depth > 0, depth, np.inf))
+        z[np.isinf(z)] = 0.0  # what meets no plane has no depth
         T_wc = inverse(T_cw)
         x, y, w = np.moveaxis((rays * z[..., None]) @ T_wc[:3, :3].T + T_wc[:3, 3], -1, 0)
         grey = 0.5 + self.contrast * (np.sin(3.0 * x + 1.0) + np.cos(4.0 * y) + np.sin(2.5 * w + x)) / 3
