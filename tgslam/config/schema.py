@@ -267,7 +267,7 @@ class ClosureConfig:
     # that shifts the plane, and no keyframe
     surface_sigma_m: float = setting(0.0003, 1e-5, 1.0)
     relinearise: float = setting(0.01, 0.0, 1.0)  # rad and m; with solver: incremental
-    # Structure closures: which keyframes are compared, and what of it becomes an edge
+    # Structure closures (formulation: closures or both): which keyframes are compared, and what of it becomes an edge
     interval: int = setting(4, 1, 1000)  # k of Table 4: at every k-th keyframe
     min_gap: int = setting(4, 1, 100_000)  # keyframes between the two
     max_edges: int = setting(5, 1, 100)  # of a keyframe to earlier ones
