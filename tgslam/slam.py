@@ -23,8 +23,7 @@ from tgslam.mapping.mapper import Mapper
 from tgslam.planes.cue import StructureCue
 from tgslam.tracking.exposure import Exposure
 from tgslam.tracking.motion import MotionFilter
-from tgslam.tracking.pyramid import NO_PLANES
-from tgslam.tracking.reference import Reference, references_of
+from tgslam.tracking.reference import NO_PLANES, Reference, references_of
 from tgslam.tracking.result import TrackingResult
 from tgslam.tracking.solver import make_tracker, track_or_recover
 from tgslam.types import Camera, Frame, FrameReport, FrameStatus, Gaussians, Plane, Trajectory
@@ -161,9 +160,11 @@ class Slam:
         depth_m = keyframes[-1].depth_m()
         median_m = float(np.median(depth_m[depth_m > 0])) if depth_m.any() else 0.0
         chosen = references_of(np.stack([k.T_cw for k in keyframes]), median_m, self._reference_count)
-        return [
-            Reference(k.colour(), k.depth_m(), k.T_cw, k.exposure) for k in (keyframes[number] for number in chosen)
-        ]
+        return [self._reference(number, keyframes[number]) for number in chosen]
+
+    def _reference(self, number: int, keyframe: Keyframe) -> Reference:
+        planes_c = self.mapper.planes.steadying(number, keyframe) if self.mapper.planes else NO_PLANES
+        return Reference(keyframe.colour(), keyframe.depth_m(), keyframe.T_cw, keyframe.exposure, planes_c)
 
     def _match_brightness(self, keyframe: Keyframe) -> None:
         previous = self.mapper.keyframes[-1]

@@ -131,7 +131,7 @@ class SeedingConfig:
     )  # the image, about so many of the largest cells: doublings of the smallest
     plane_cells_across: int = setting(40, 1, 10_000)  # likewise on one plane (PGI)
     plain_colour_std: float = setting(0.015, 0.0, 1.0)  # a cell whose channels vary less has no texture
-    plane_colour_std: float = setting(0.022, 0.0, 1.0)  # likewise for a cell on one plane, but for a linear trend
+    plane_colour_std: float = setting(0.024, 0.0, 1.0)  # likewise for a cell on one plane, but for a linear trend
     planar_sigmas: float = setting(2.5, 0.0, 100.0)  # a cell whose plane residual is less, in sensor sigmas, is flat
     overlap: float = setting(0.6, 0.1, 3.0)  # standard deviation of a Gaussian in cell sizes
     thickness: float = setting(0.1, 1e-3, 1.0)  # standard deviation along the normal, relative to across
@@ -277,7 +277,7 @@ class ClosureConfig:
     gate_probability: float = setting(0.99, 0.5, 1.0)  # of a right measurement to pass a chi-square test
     # Their refinement (multi-plane ICP)
     icp_rounds: int = setting(3, 0, 100)  # 0 = off
-    samples_px: int = setting(8, 1, 64)  # every n-th pixel and row is used
+    samples_px: int = setting(2, 1, 64)  # every n-th pixel and row: of too few, fits are worse than the views' own
     model_sigma_m: float = setting(0.003, 1e-5, 1.0)  # real surfaces are not quite planes
     match_distance_m: float = setting(0.1, 0.001, 10.0)  # of points off planes; those farther apart do not match
     min_matches: int = setting(60, 1, 1_000_000)  # of them, for their word to count

@@ -20,6 +20,7 @@ from tgslam.planes.extraction import extract_planes
 from tgslam.planes.instance import NO_ID, PlanarInstance
 from tgslam.planes.registry import PlaneRegistry
 from tgslam.planes.table import PlaneTable
+from tgslam.tracking.reference import NO_PLANES
 from tgslam.types import Camera
 
 _MAX_SLANT = 0.1  # of its depth by which a plane's changes at most where it continues into a hole
@@ -27,6 +28,10 @@ _CLOSING_PX = 7  # window in which a PGI may surround a pixel
 _CLOSING_SHARE = 0.6  # of its pixels that must be the PGI's
 _GLANCE_PX = 4  # between the pixels that tell whether a keyframe shows a plane at all
 _AGREEMENT = 5.0  # standard deviations of sensor and model between a PGI and a measurement that counts as its
+
+# Of the pixels' normals, that planes give the camera in each direction at least: measured normals are off by 0.1 to 0.2
+# rad, so that noise alone gives 1 to 3 %
+_HELD = 0.05
 
 
 @dataclass(frozen=True)
@@ -102,6 +107,31 @@ class PlanarMapping:
     def seen_from(self, number: int) -> list[PlanarInstance]:
         """The PGIs that a keyframe saw."""
         return [self.instances[i] for i in self.registry.seen_from(number)]
+
+    def steadying(self, number: int, keyframe: Keyframe) -> NDArray[np.float64]:
+        """[P, 4] n . x + d = 0 in a keyframe's camera: the PGIs whose normals its surfaces take in tracking.
+
+        Those are all that it saw, if together they leave a direction free, along which noise of measured normals would
+        hold the camera; else none, since measured normals follow what real surfaces stray from planes by. number: the
+        keyframe's.
+        """
+        if self._least_held(keyframe) >= _HELD:
+            return NO_PLANES
+        planes_w = np.array([(*plane.normal_w, plane.offset_m) for plane in self.seen_from(number)]).reshape(-1, 4)
+        return planes_w @ inverse(keyframe.T_cw)
+
+    def _least_held(self, keyframe: Keyframe) -> float:
+        """Share of a keyframe's depth whose normals point in the direction in which the fewest do.
+
+        What is on no plane is taken to face all directions alike.
+        """
+        assert keyframe.plane_ids is not None
+        normals = self.table().planes_w[:, :3]
+        pixels = np.bincount(keyframe.plane_ids[keyframe.plane_ids >= 0], minlength=len(normals))
+        measured = max(int(np.count_nonzero(keyframe.depth_m())), 1)
+        others = max(measured - int(pixels.sum()), 0)
+        moments = np.einsum("n,ni,nj->ij", pixels, normals, normals)
+        return (float(np.linalg.eigvalsh(moments)[0]) + others / 3.0) / measured
 
     def label(self, gaussians: GaussianMap, T_cw: NDArray[np.float64], pixels: PlanarPixels) -> None:
         """Tie the Gaussians in a keyframe's image to the PGIs that its pixels name, where they lie on them.

@@ -17,7 +17,6 @@ from tgslam.tracking.exposure import Exposure, fit_exposure
 from tgslam.tracking.linearisation import Lineariser, NormalEquations
 from tgslam.tracking.lost import LostDetector
 from tgslam.tracking.pyramid import (
-    NO_PLANES,
     LiveLevel,
     LivePyramid,
     ModelLevel,
@@ -25,7 +24,7 @@ from tgslam.tracking.pyramid import (
     ReferencePyramid,
     finest_level,
 )
-from tgslam.tracking.reference import Reference
+from tgslam.tracking.reference import NO_PLANES, Reference
 from tgslam.tracking.result import TrackingResult
 from tgslam.types import Camera, Frame
 
@@ -70,7 +69,7 @@ class GaussNewtonTracker:
         """See `Tracker.know`."""
         self._planes_w = planes_w
         self._references = [
-            (pyramid.update(reference, planes_w @ inverse(reference.T_cw)), reference)
+            (pyramid.update(reference), reference)
             for pyramid, reference in zip(self._reference_pyramids, references, strict=False)
         ]
 

@@ -16,10 +16,8 @@ from tgslam.config.schema import LossConfig
 from tgslam.kernels import alignment
 from tgslam.kernels import image as kernels
 from tgslam.render import RenderImages
-from tgslam.tracking.reference import Reference
+from tgslam.tracking.reference import NO_PLANES, Reference
 from tgslam.types import Camera, Frame
-
-NO_PLANES: NDArray[np.float64] = np.zeros((0, 4))
 
 # blocks of 2x2 px on each side: a rendered surface has little noise, and wide fits of a measured one round its edges
 _NORMAL_RADIUS = 1
@@ -122,13 +120,13 @@ class ReferencePyramid:
         self.levels = [_model_level(camera.halved(first + level), measured=True) for level in range(levels)]
         self._fits = [images.PlaneFits(level.camera, _NORMAL_RADIUS, loss.depth_sigma_per_m2) for level in self.levels]
 
-    def update(self, reference: Reference, planes_c: NDArray[np.float64]) -> list[ModelLevel]:
-        """Take in a keyframe; the result is valid until the next one. planes_c: see `ModelPyramid.update`."""
+    def update(self, reference: Reference) -> list[ModelLevel]:
+        """Take in a keyframe; the result is valid until the next one."""
         base = self._images.base
         colour, depth_m = runtime.to_device(reference.colour), runtime.to_device(reference.depth_m)
         images.reduce_frame(colour, depth_m, base.grey, base.depth)
         for level, pair, fits in zip(self.levels, self._images.halvings(), self._fits, strict=True):
-            _write_model(level, pair, fits, planes_c)
+            _write_model(level, pair, fits, reference.planes_c)
         return self.levels
 
 

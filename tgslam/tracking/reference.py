@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.geometry import inverse
 from tgslam.tracking.exposure import Exposure
+
+NO_PLANES: NDArray[np.float64] = np.zeros((0, 4))
 
 # Between two views that show the same alike at most, relative to the median depth: from farther away noise is larger
 _BASELINE = 0.8
@@ -24,6 +26,7 @@ class Reference:
     depth_m: NDArray[np.float32]  # [H, W], 0 = none
     T_cw: NDArray[np.float64]  # [4, 4]
     exposure: Exposure  # of its image
+    planes_c: NDArray[np.float64] = field(default_factory=lambda: NO_PLANES)  # [P, 4] whose normals its surfaces take
 
 
 def references_of(T_cw: NDArray[np.float64], median_depth_m: float, count: int) -> list[int]:
