@@ -117,6 +117,19 @@ def test_points_improve_poor_plane_fits() -> None:
     assert np.sqrt(np.mean(np.square(after))) < 0.4 * np.sqrt(np.mean(np.square(before)))
 
 
+def test_points_do_not_spoil_good_plane_fits() -> None:
+    """Fits to all pixels of a view are that good: those of the ICP, to some of them, must not be worse."""
+    before, after = [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        views = [view(T, rng, balls=False) for T in WALK]
+        planes = [fits(seen, T, rng, noise=0.15) for seen, T in zip(views, WALK, strict=True)]
+        start, found = refined(views, planes, motion(), ClosureConfig())
+        before.append(start.directions @ error_of(start))
+        after.append(start.directions @ error_of(found))
+    assert np.sqrt(np.mean(np.square(after))) < 0.6 * np.sqrt(np.mean(np.square(before)))
+
+
 def test_pixels_of_something_else_are_left_out() -> None:
     rng = np.random.default_rng(0)
     views = [view(T, rng, balls=False) for T in WALK]

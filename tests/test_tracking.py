@@ -26,8 +26,8 @@ from tgslam.tracking.first_order import FirstOrderTracker
 from tgslam.tracking.gauss_newton import GaussNewtonTracker
 from tgslam.tracking.lost import LostDetector
 from tgslam.tracking.motion import MotionFilter
-from tgslam.tracking.pyramid import NO_PLANES, LiveLevel, LivePyramid, ModelLevel, ModelPyramid, finest_level
-from tgslam.tracking.reference import Reference, references_of
+from tgslam.tracking.pyramid import LiveLevel, LivePyramid, ModelLevel, ModelPyramid, finest_level
+from tgslam.tracking.reference import NO_PLANES, Reference, references_of
 from tgslam.tracking.result import TrackingResult
 from tgslam.tracking.solver import make_tracker, track_or_recover
 from tgslam.types import Camera, Frame
@@ -306,20 +306,36 @@ class Rippled(Planes):
         return RenderImages(*(runtime.to_device(image) for image in images))
 
 
+WALL_NORMAL = np.array(WALL[0]) / np.linalg.norm(WALL[0])
+WALL_PLANE = np.array([[*WALL_NORMAL, WALL[1] / np.linalg.norm(WALL[0])]])  # in the world
+
+
+def held_along_the_wall(tracker: GaussNewtonTracker, scene: Planes) -> float:
+    """Information on the camera's place along the wall, which is in plain view; and the distance from it is right."""
+    along = np.array([0.0, 0.0, 0.0, *np.cross(WALL_NORMAL, [0.0, 1.0, 0.0])])
+    result = tracker.track(scene.frame(MOTION), None, np.eye(4), Exposure())
+    assert abs(WALL_NORMAL @ (inverse(result.T_cw) - inverse(MOTION))[:3, 3]) < 5e-4
+    information = tracker.track(scene.frame(np.eye(4)), None, np.eye(4), Exposure()).information
+    return float(along @ information @ along)
+
+
 def test_ripples_on_a_known_plane_do_not_hold_the_camera_along_it():
     scene = Rippled((WALL,), camera=LARGE)
-    normal = np.array(WALL[0]) / np.linalg.norm(WALL[0])
-    plane_w = np.array([[*normal, WALL[1] / np.linalg.norm(WALL[0])]])
-    along = np.array([0.0, 0.0, 0.0, *np.cross(normal, [0.0, 1.0, 0.0])])
     unknown, known = exact_tracker(scene), exact_tracker(scene)
-    known.know(plane_w, [])
-    held = [
-        along @ one.track(scene.frame(np.eye(4)), None, np.eye(4), Exposure()).information @ along
-        for one in (unknown, known)
-    ]
+    known.know(WALL_PLANE, [])
+    assert held_along_the_wall(known, scene) < 0.01 * held_along_the_wall(unknown, scene)
+
+
+def test_nor_do_those_of_a_keyframe_that_takes_the_normal_of_its_plane():
+    scene, rippled = Planes((WALL,), camera=LARGE), Rippled((WALL,), camera=LARGE)
+    T_cw = NEARBY[0]
+    depth_m = runtime.to_host(rippled.forward(None, T_cw).depth)
+    held = []
+    for planes_c in (NO_PLANES, WALL_PLANE @ inverse(T_cw)):
+        tracker = exact_tracker(scene)
+        tracker.know(NO_PLANES, [Reference(scene.frame(T_cw).colour, depth_m, T_cw, Exposure(), planes_c)])
+        held.append(held_along_the_wall(tracker, scene))
     assert held[1] < 0.01 * held[0]
-    result = known.track(scene.frame(MOTION), None, np.eye(4), Exposure())
-    assert abs(normal @ (inverse(result.T_cw) - inverse(MOTION))[:3, 3]) < 5e-4
 
 
 class Farther(Planes):
