@@ -127,7 +127,7 @@ class PlanarMapping:
         """
         assert keyframe.plane_ids is not None
         normals = self.table().planes_w[:, :3]
-        pixels = np.bincount(keyframe.plane_ids[keyframe.plane_ids >= 0], minlength=len(normals))
+        pixels = np.bincount(keyframe.plane_ids[keyframe.plane_ids >= 0], minlength=len(normals)) * normals.any(axis=1)
         measured = max(int(np.count_nonzero(keyframe.depth_m())), 1)
         others = max(measured - int(pixels.sum()), 0)
         moments = np.einsum("n,ni,nj->ij", pixels, normals, normals)
