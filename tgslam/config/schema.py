@@ -131,7 +131,7 @@ class SeedingConfig:
     )  # the image, about so many of the largest cells: doublings of the smallest
     plane_cells_across: int = setting(40, 1, 10_000)  # likewise on one plane (PGI)
     plain_colour_std: float = setting(0.015, 0.0, 1.0)  # a cell whose channels vary less has no texture
-    plane_colour_std: float = setting(0.024, 0.0, 1.0)  # likewise for a cell on one plane, but for a linear trend
+    plane_colour_std: float = setting(0.022, 0.0, 1.0)  # likewise for a cell on one plane, but for a linear trend
     planar_sigmas: float = setting(2.5, 0.0, 100.0)  # a cell whose plane residual is less, in sensor sigmas, is flat
     overlap: float = setting(0.6, 0.1, 3.0)  # standard deviation of a Gaussian in cell sizes
     thickness: float = setting(0.1, 1e-3, 1.0)  # standard deviation along the normal, relative to across
@@ -226,7 +226,7 @@ class PlanesConfig:
 class StructureConfig:
     """What planes ask of the map: the instance field (Eqs. 1-4) and the regularisers (Eqs. 8, 9), as of Eq. 14."""
 
-    lambda_pgi: float = setting(0.1, 0.0, 100.0)  # what E_pgi weighs for geometry; 0 = no instance field
+    lambda_pgi: float = setting(0.01, 0.0, 100.0)  # what E_pgi weighs for geometry; 0 = no instance field
     identity: str = setting("colour", choices=("colour", "scalar"))  # what a Gaussian carries of its plane's id
     scalar_ids: int = setting(64, 1, 100_000)  # with identity: scalar, ids that can be told apart
     pgi_interval: int = setting(3, 1, 1000)  # refinements of a keyframe, from one that sees its planes to the next
