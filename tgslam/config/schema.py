@@ -226,7 +226,7 @@ class PlanesConfig:
 class StructureConfig:
     """What planes ask of the map: the instance field (Eqs. 1-4) and the regularisers (Eqs. 8, 9), as of Eq. 14."""
 
-    lambda_pgi: float = setting(0.01, 0.0, 100.0)  # what E_pgi weighs for geometry; 0 = no instance field
+    lambda_pgi: float = setting(0.03, 0.0, 100.0)  # what E_pgi weighs for geometry; 0 = no instance field
     identity: str = setting("colour", choices=("colour", "scalar"))  # what a Gaussian carries of its plane's id
     scalar_ids: int = setting(64, 1, 100_000)  # with identity: scalar, ids that can be told apart
     pgi_interval: int = setting(3, 1, 1000)  # refinements of a keyframe, from one that sees its planes to the next
