@@ -27,6 +27,7 @@ _FIXED = 1e-6  # rad and m, of the first keyframe: it holds the graph
 _LOOSE = np.diag([10.0**-2] * 3 + [1000.0**-2] * 3)  # rad, m: odometry that says nothing leaves the graph regular
 _ROUNDS = 5  # updates at most of one call, until nothing has to be linearised anew
 _MAX_ITERATIONS = 50  # of the batch solver
+_TURNS = np.stack([hat(axis) for axis in np.eye(3)])  # [3, 3, 3] generators of rotations
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,7 @@ class PoseGraph:
         self._keyframes: list[int] = []
         self._edges: list[_Edge] = []
         self._sightings: list[_Sighting] = []
+        self._plane_ids: set[int] = set()  # of the sightings
         self._origin: tuple[int, Vector] | None = None
         self._values = gtsam.Values()  # the latest estimate, with a first guess of what is new
         self._fresh_factors = gtsam.NonlinearFactorGraph()
@@ -114,21 +116,22 @@ class PoseGraph:
         """
         for keyframe in (i, j):
             self._pose_of(keyframe)
-        self._add(_Edge(i, j, motion, closure=True, robust=robust))
+        edge = _Edge(i, j, motion, closure=True, robust=robust)
+        _check(edge)
+        self._add(edge)
 
     def add_plane_observation(self, keyframe: int, plane_id: int, plane: PlaneEstimate) -> None:
         """A keyframe sees a plane; `plane` is that view's own, in its camera's frame.
 
         Raises GraphError for an unknown keyframe, or for a plane without a sound covariance.
         """
-        T_wc, key = self._pose_of(keyframe).matrix(), _landmark(plane_id)
-        if not (np.isfinite(plane.covariance).all() and np.linalg.eigvalsh(plane.covariance)[0] > 0.0):
-            raise GraphError(f"plane {plane_id} as keyframe {keyframe} saw it has no sound covariance")
+        pose, key = self._pose_of(keyframe), _landmark(plane_id)
         sighting = _Sighting(keyframe, plane_id, plane)
-        self._sightings.append(sighting)
         self._fresh_factors.push_back(self._plane_factor(sighting))
+        self._sightings.append(sighting)
+        self._plane_ids.add(plane_id)
         if not self._values.exists(key):
-            world = plane.transformed(T_wc)
+            world = plane.transformed(pose.matrix())
             self._insert(key, gtsam.OrientedPlane3(np.append(world.normal, world.offset_m)))
 
     def replace_planes(self, sightings: Mapping[int, Mapping[int, PlaneEstimate]]) -> None:
@@ -138,9 +141,9 @@ class PoseGraph:
         of everything.
         """
         kept = {plane_id for seen in sightings.values() for plane_id in seen}
-        for plane_id in {sighting.plane_id for sighting in self._sightings} - kept:
+        for plane_id in self._plane_ids - kept:
             self._values.erase(_landmark(plane_id))
-        self._sightings = []
+        self._sightings, self._plane_ids = [], set()
         for keyframe, seen in sightings.items():
             for plane_id, plane in seen.items():
                 self.add_plane_observation(keyframe, plane_id, plane)
@@ -166,7 +169,7 @@ class PoseGraph:
         flat = gtsam.utilities.extractPose3(self._values)
         T_wc = np.tile(np.eye(4), (len(flat), 1, 1))
         T_wc[:, :3, :3], T_wc[:, :3, 3] = flat[:, :9].reshape(-1, 3, 3), flat[:, 9:]
-        plane_ids = sorted({sighting.plane_id for sighting in self._sightings})
+        plane_ids = sorted(self._plane_ids)
         planes = [self._values.atOrientedPlane3(_landmark(plane)).planeCoefficients() for plane in plane_ids]
         return GraphEstimate(
             np.array(sorted(self._keyframes), np.int64),
@@ -201,7 +204,6 @@ class PoseGraph:
             values.insert(key, value)
 
     def _add(self, edge: _Edge) -> None:
-        _check(edge)
         self._edges.append(edge)
         self._fresh_factors.push_back(self._edge_factor(edge))
 
@@ -249,8 +251,12 @@ class PoseGraph:
 
     def _plane_factor(self, sighting: _Sighting) -> gtsam.CustomFactor:
         keys = _pose(sighting.keyframe), _landmark(sighting.plane_id)
-        noise = self._robust(gtsam.noiseModel.Unit.Create(3))
-        return gtsam.CustomFactor(noise, list(keys), _PlaneError(keys, sighting.plane))
+        try:
+            error = _PlaneError(keys, sighting.plane)
+        except np.linalg.LinAlgError as bad:
+            name = f"plane {sighting.plane_id} as keyframe {sighting.keyframe} saw it"
+            raise GraphError(f"{name} has no sound covariance") from bad
+        return gtsam.CustomFactor(self._robust(gtsam.noiseModel.Unit.Create(3)), list(keys), error)
 
     def _robust(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
         scale = self._config.robust_sigmas
@@ -279,12 +285,19 @@ class _PlaneError:
     """
 
     def __init__(self, keys: tuple[int, int], plane: PlaneEstimate) -> None:
-        """keys: gtsam's, of the keyframe and of the plane."""
+        """keys: gtsam's, of the keyframe and of the plane. Raises LinAlgError without a sound covariance."""
         self._keys = keys
         first, second = plane.axes
-        white = _root(np.linalg.inv(plane.covariance))
-        self._by_normal = white @ np.stack([-second, first, -plane.centroid])  # [3, 3]
-        self._by_offset = -white[:, 2]
+        white = np.linalg.inv(np.linalg.cholesky(plane.covariance))
+        if not np.isfinite(white).all():
+            raise np.linalg.LinAlgError
+        self._by_plane = np.empty((3, 4))  # of (n, d) in the camera's frame
+        np.matmul(white, np.array([-second, first, -plane.centroid]), out=self._by_plane[:, :3])
+        np.negative(white[:, 2], out=self._by_plane[:, 3])
+        by_pose = np.empty((3, 3, 6))  # what each component of n adds to the jacobian
+        by_pose[:, :, :3] = self._by_plane[:, :3] @ _TURNS
+        by_pose[:, :, 3:] = self._by_plane[:, 3, None] * np.eye(3)[:, None]
+        self._by_pose = by_pose.reshape(3, 18)
 
     def __call__(
         self, factor: gtsam.CustomFactor | None, values: gtsam.Values, jacobians: list[Vector] | None
@@ -292,15 +305,13 @@ class _PlaneError:
         T_wc = values.atPose3(self._keys[0]).matrix()
         plane_w = values.atOrientedPlane3(self._keys[1])
         coefficients = plane_w.planeCoefficients()
-        R, t = T_wc[:3, :3], T_wc[:3, 3]
-        normal_c = coefficients[:3] @ R
-        offset_c = coefficients[3] + coefficients[:3] @ t
+        by_normal_w, by_offset = self._by_plane @ T_wc[:3].T, self._by_plane[:, 3]
         if jacobians is not None:
-            basis = plane_w.normal().basis()
-            jacobians[0] = np.hstack([self._by_normal @ hat(normal_c), np.outer(self._by_offset, normal_c)])
-            of_normal = self._by_normal @ (R.T @ basis) + np.outer(self._by_offset, t @ basis)
-            jacobians[1] = np.column_stack([of_normal, self._by_offset])
-        error: Vector = self._by_normal @ normal_c + self._by_offset * offset_c
+            jacobians[0] = (coefficients[:3] @ T_wc[:3, :3] @ self._by_pose).reshape(3, 6)
+            of_plane = np.empty((3, 3))
+            of_plane[:, :2], of_plane[:, 2] = by_normal_w @ plane_w.normal().basis(), by_offset
+            jacobians[1] = of_plane
+        error: Vector = by_normal_w @ coefficients[:3] + by_offset * coefficients[3]
         return error
 
 

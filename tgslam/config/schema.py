@@ -266,7 +266,7 @@ class ClosureConfig:
     # Landmarks: by what a surface strays from its plane in one view and not in others. Most of it all views see alike:
     # that shifts the plane, and no keyframe
     surface_sigma_m: float = setting(0.0003, 1e-5, 1.0)
-    relinearise: float = setting(0.01, 0.0, 1.0)  # rad and m; with solver: incremental
+    relinearise: float = setting(0.02, 0.0, 1.0)  # rad and m; with solver: incremental
     # Structure closures (formulation: closures or both): which keyframes are compared, and what of it becomes an edge
     interval: int = setting(4, 1, 1000)  # k of Table 4: at every k-th keyframe
     min_gap: int = setting(4, 1, 100_000)  # keyframes between the two
