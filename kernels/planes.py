@@ -34,9 +34,24 @@ def plane_at(planes: ti.template(), k, x, y):
 
 
 @ti.func
-def misfit(depth: ti.template(), planes: ti.template(), k, u, v, cx, cy):
+def misfit(inverse: ti.template(), planes: ti.template(), k, u, v, cx, cy):
     """Measured less predicted inverse depth, 1/m, at a pixel with a measurement."""
-    return 1.0 / depth[v, u] - plane_at(planes, k, u - cx, v - cy)
+    return inverse[v, u] - plane_at(planes, k, u - cx, v - cy)
+
+
+@ti.kernel
+def inverse_depth(
+    depth: nd(ti.f32, ndim=2),  # [H, W] m, 0 = none
+    columns: ti.i32,  # segments of a row, so that threads have enough to share
+    inverse: nd(ti.f32, ndim=2),  # [H, W] 1/m, 0 = none, out
+):
+    """What the kernels below ask for many times."""
+    width = depth.shape[1]
+    for s in range(depth.shape[0] * columns):
+        v, part = s // columns, s % columns
+        for u in range(part * width // columns, (part + 1) * width // columns):
+            z = depth[v, u]
+            inverse[v, u] = ti.select(z > 0.0, 1.0 / z, 0.0)
 
 
 @ti.kernel
@@ -108,20 +123,62 @@ def candidates(
 
 
 @ti.func
-def window_misfit(depth: ti.template(), planes: ti.template(), k, u, v, cx, cy, tolerance):
+def cut_square(inverse: ti.template(), g0, gx, gy, x, y, v, u, tolerance):
+    """Squared misfit of the pixel (v, u), which is (x, y) px from the principal point, cut at the tolerance."""
+    off = ti.min(ti.abs(inverse[v, u] - (g0 + gx * x + gy * y)), tolerance)
+    return ti.select(inverse[v, u] > 0.0, off * off, 0.0)
+
+
+@ti.func
+def window_misfit(inverse: ti.template(), planes: ti.template(), k, u, v, cx, cy, tolerance):
     """Sum of squared misfits about a pixel, each cut at the tolerance."""
+    height, width = inverse.shape[0], inverse.shape[1]
+    g0, gx, gy = planes[k, 0], planes[k, 1], planes[k, 2]
     total = 0.0
-    for r in range(ti.max(v - _WINDOW, 0), ti.min(v + _WINDOW + 1, depth.shape[0])):
-        for s in range(ti.max(u - _WINDOW, 0), ti.min(u + _WINDOW + 1, depth.shape[1])):
-            if depth[r, s] > 0.0:
-                off = ti.min(ti.abs(misfit(depth, planes, k, s, r, cx, cy)), tolerance)
-                total += off * off
+    if _WINDOW <= v < height - _WINDOW and _WINDOW <= u < width - _WINDOW:
+        for i, j in ti.static(ti.ndrange((-_WINDOW, _WINDOW + 1), (-_WINDOW, _WINDOW + 1))):
+            total += cut_square(inverse, g0, gx, gy, u + j - cx, v + i - cy, v + i, u + j, tolerance)
+    else:
+        for r in range(ti.max(v - _WINDOW, 0), ti.min(v + _WINDOW + 1, height)):
+            for s in range(ti.max(u - _WINDOW, 0), ti.min(u + _WINDOW + 1, width)):
+                total += cut_square(inverse, g0, gx, gy, s - cx, r - cy, r, s, tolerance)
     return total
+
+
+@ti.func
+def label_by_one(inverse: ti.template(), planes: ti.template(), k, u, v, cx, cy, tolerance):
+    """Plane k, if the pixel is measured and fits it."""
+    fits = inverse[v, u] > 0.0 and ti.abs(misfit(inverse, planes, k, u, v, cx, cy)) <= tolerance
+    return ti.select(fits, k, -1)
+
+
+@ti.func
+def label_by_several(
+    inverse: ti.template(), planes: ti.template(), near: ti.template(), within: ti.template(), u, v, cx, cy
+):
+    """The one of the planes `near` [4] within the tolerances [4], -1 = none; of several, which the window fits."""
+    label, fitting = -1, 0
+    if inverse[v, u] > 0.0:
+        for m in ti.static(range(CANDIDATES)):
+            if near[m] >= 0:
+                fits = ti.abs(misfit(inverse, planes, near[m], u, v, cx, cy)) <= within[m]
+                fitting += ti.select(fits, 1, 0)
+                label = ti.select(fits, near[m], label)
+    if fitting > 1:
+        least = 1e30
+        for m in ti.static(range(CANDIDATES)):
+            if near[m] >= 0:
+                if ti.abs(misfit(inverse, planes, near[m], u, v, cx, cy)) <= within[m]:
+                    total = window_misfit(inverse, planes, near[m], u, v, cx, cy, within[m])
+                    if total < least:
+                        least = total
+                        label = near[m]
+    return label
 
 
 @ti.kernel
 def label_pixels(
-    depth: nd(ti.f32, ndim=2),  # [H, W] m, 0 = none
+    inverse: nd(ti.f32, ndim=2),  # [H, W] 1/m, 0 = none
     cx: ti.f32,
     cy: ti.f32,
     cell: ti.i32,  # px
@@ -133,38 +190,25 @@ def label_pixels(
 ):
     """Each pixel's plane: that one of the cell's candidates within the tolerance; of several, which its window fits."""
     for c in range(found.shape[0]):
-        top, bottom, left, right, _, _ = extent(c, cell, columns, depth.shape[0], depth.shape[1])
+        top, bottom, left, right, _, _ = extent(c, cell, columns, inverse.shape[0], inverse.shape[1])
         near = ti.Vector([-1] * CANDIDATES)
-        within = ti.Vector([-1.0] * CANDIDATES)  # nothing is
-        fit = ti.Matrix([[0.0] * 3] * CANDIDATES)
+        within = ti.Vector([0.0] * CANDIDATES)
         for m in ti.static(range(CANDIDATES)):
-            k = found[c, m]
-            if k >= 0:
-                near[m] = k
-                within[m] = tolerance[k]
-                for n in ti.static(range(3)):
-                    fit[m, n] = planes[k, n]
-        for v in range(top, bottom):
-            for u in range(left, right):
-                label, fitting = -1, 0
-                if depth[v, u] > 0.0:
-                    w = 1.0 / depth[v, u]
-                    for m in ti.static(range(CANDIDATES)):
-                        off = w - (fit[m, 0] + fit[m, 1] * (u - cx) + fit[m, 2] * (v - cy))
-                        fits = ti.abs(off) <= within[m]
-                        fitting += ti.select(fits, 1, 0)
-                        label = ti.select(fits, near[m], label)
-                if fitting > 1:
-                    least = 1e30
-                    for m in range(CANDIDATES):
-                        k = found[c, m]
-                        if k >= 0:
-                            if ti.abs(misfit(depth, planes, k, u, v, cx, cy)) <= tolerance[k]:
-                                total = window_misfit(depth, planes, k, u, v, cx, cy, tolerance[k])
-                                if total < least:
-                                    least = total
-                                    label = k
-                labels[v, u] = label
+            near[m] = found[c, m]
+            if near[m] >= 0:
+                within[m] = tolerance[near[m]]
+        if near[0] < 0:
+            for v in range(top, bottom):
+                for u in range(left, right):
+                    labels[v, u] = -1
+        elif near[1] < 0:  # most cells lie within one plane
+            for v in range(top, bottom):
+                for u in range(left, right):
+                    labels[v, u] = label_by_one(inverse, planes, near[0], u, v, cx, cy, within[0])
+        else:
+            for v in range(top, bottom):
+                for u in range(left, right):
+                    labels[v, u] = label_by_several(inverse, planes, near, within, u, v, cx, cy)
 
 
 @ti.func
@@ -178,6 +222,19 @@ def alike(labels: ti.template(), v, u):
     return count
 
 
+@ti.func
+def surrounded(labels: ti.template(), v, u):
+    """Whether all 8 pixels around one share its label; those beyond the image are as the nearest ones in it."""
+    result = True
+    if 0 < v < labels.shape[0] - 1 and 0 < u < labels.shape[1] - 1:
+        for r in ti.static(range(-1, 2)):
+            for q in ti.static(range(-1, 2)):
+                result = result and labels[v + r, u + q] == labels[v, u]
+    else:
+        result = alike(labels, v, u) == 8
+    return result
+
+
 @ti.kernel
 def drop_lonely(
     labels: nd(ti.i32, ndim=2),  # [H, W] -1 = none
@@ -189,12 +246,15 @@ def drop_lonely(
     for s in range(height * columns):
         v, part = s // columns, s % columns
         for u in range(part * width // columns, (part + 1) * width // columns):
-            kept[v, u] = ti.select(alike(labels, v, u) >= _MIN_ALIKE, labels[v, u], -1)
+            label = labels[v, u]
+            if label >= 0 and not surrounded(labels, v, u):
+                label = ti.select(alike(labels, v, u) >= _MIN_ALIKE, label, -1)
+            kept[v, u] = label
 
 
 @ti.kernel
 def segment_sums(
-    depth: nd(ti.f32, ndim=2),  # [H, W] m, 0 = none
+    inverse: nd(ti.f32, ndim=2),  # [H, W] 1/m, 0 = none
     cx: ti.f32,
     cy: ti.f32,
     cell: ti.i32,  # px
@@ -210,7 +270,7 @@ def segment_sums(
     Pixels at the rim of a segment weigh less: they may show what is beside it, and turn narrow segments most.
     """
     for c in range(found.shape[0]):
-        top, bottom, left, right, x0, y0 = extent(c, cell, columns, depth.shape[0], depth.shape[1])
+        top, bottom, left, right, x0, y0 = extent(c, cell, columns, inverse.shape[0], inverse.shape[1])
         for m in range(CANDIDATES):
             k = found[c, m]
             total = ti.Vector([0.0] * SEGMENT_SUMS)
@@ -219,9 +279,9 @@ def segment_sums(
                     y = v - y0
                     for u in range(left, right):
                         if labels[v, u] == k:
-                            x, r = u - x0, misfit(depth, planes, k, u, v, cx, cy)
+                            x, r = u - x0, misfit(inverse, planes, k, u, v, cx, cy)
                             q = 1.0 / ti.sqrt(1.0 + (r / scale) * (r / scale))
-                            q *= ti.select(alike(labels, v, u) < 8, _RIM_WEIGHT, 1.0)
+                            q *= ti.select(surrounded(labels, v, u), 1.0, _RIM_WEIGHT)
                             total += ti.Vector(
                                 [q, q * x, q * y, q * x * x, q * x * y, q * y * y, q * r, q * x * r, q * y * r,
                                  q * r * r, 1.0, r * r]

@@ -74,7 +74,9 @@ class PixelLabels:
     def __init__(self, depth_m: np.ndarray, grid: CellGrid, cell_labels: Labels) -> None:
         """depth_m: device [H, W] m, 0 = none. cell_labels: [rows, columns] plane of each cell, -1 = none."""
         camera = grid.camera
-        self._depth_m = require("depth_m", depth_m, (camera.height, camera.width))
+        require("depth_m", depth_m, (camera.height, camera.width))
+        self._inverse = runtime.empty(depth_m.shape)
+        kernels.inverse_depth(depth_m, SPLIT, self._inverse)
         self._grid = grid
         self._where = (camera.cx, camera.cy, grid.cell_px, grid.shape[1])
         self._found = runtime.empty((len(grid), kernels.CANDIDATES), np.int32)
@@ -86,9 +88,9 @@ class PixelLabels:
 
         tolerance: [P] 1/m. Where several fit, the 5 x 5 pixels around decide; pixels alone with their label lose it.
         """
-        raw = runtime.empty(self._depth_m.shape, np.int32)
+        raw = runtime.empty(self._inverse.shape, np.int32)
         kernels.label_pixels(
-            self._depth_m, *self._where, self._found, runtime.to_device(planes), runtime.to_device(tolerance), raw
+            self._inverse, *self._where, self._found, runtime.to_device(planes), runtime.to_device(tolerance), raw
         )
         kernels.drop_lonely(raw, SPLIT, self._labels)
 
@@ -97,7 +99,7 @@ class PixelLabels:
         grid = self._grid
         out = runtime.empty((len(grid), kernels.CANDIDATES, kernels.SEGMENT_SUMS))
         kernels.segment_sums(
-            self._depth_m, *self._where, self._found, runtime.to_device(planes), self._labels, scale, out
+            self._inverse, *self._where, self._found, runtime.to_device(planes), self._labels, scale, out
         )
         found, values = runtime.to_host(self._found), runtime.to_host(out)
         values = values.reshape(-1, kernels.SEGMENT_SUMS)

@@ -222,7 +222,7 @@ def _standing_off(
     mask.ravel()[cell], image.ravel()[cell] = 1.0, misfit
     window = (_WINDOW_CELLS, _WINDOW_CELLS)
     mean = (cv2.blur(image, window) / np.maximum(cv2.blur(mask, window), 1e-6)).ravel()[cell]
-    limit = _OFF_SIGMAS * _DEVIATION * float(np.median(np.abs(mean)))
+    limit = _OFF_SIGMAS * _DEVIATION * _median(np.abs(mean))
     parts = []
     for side in (1.0, -1.0):
         off = side * mean > limit
@@ -253,7 +253,7 @@ def _strips(
         cells, sums = (cv2.filter2D(i, -1, window, borderType=cv2.BORDER_CONSTANT).ravel()[cell] for i in (mask, image))
         whole = cells >= 0.5 * float(window.sum())
         sums = np.where(whole, sums / np.sqrt(np.maximum(cells, 1.0)), 0.0)
-        sigma = _DEVIATION * float(np.median(np.abs(sums[whole]))) if whole.any() else 0.0
+        sigma = _DEVIATION * _median(np.abs(sums[whole])) if whole.any() else 0.0
         for height in (sums, -sums):
             if height.max() > _SURE_SIGMAS * sigma:
                 parts = _above(_LIKELY_SIGMAS * sigma, height, cell, shape, points, least_px)
@@ -263,6 +263,13 @@ def _strips(
         if sigmas > _SURE_SIGMAS and not any((part & other).any() for other in chosen):
             chosen.append(part)
     return chosen
+
+
+def _median(values: Floats) -> float:
+    """Of one value or more, finite; NumPy's own looks for much else, and takes ten times as long on a few hundred."""
+    low, high = (len(values) - 1) // 2, len(values) // 2
+    middle = np.partition(values, (low, high))
+    return float(0.5 * (middle[low] + middle[high]))
 
 
 def _above(
