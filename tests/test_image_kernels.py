@@ -209,7 +209,8 @@ def surface_of(camera, depth):
     return fits, surface
 
 
-def test_adopted_normals_match_the_twin(rng):
+@pytest.mark.parametrize(("measured", "least_cosine"), [(False, 0.98), (True, 0.8)])
+def test_adopted_normals_match_the_twin(rng, measured, least_cosine):
     camera = Camera(45, 33, 40.0, 42.0, 21.0, 17.0)
     depth = plane_depth(camera, facing(25, 70), 1.2)
     depth[:, 30:] = plane_depth(camera, facing(40, 200), 2.0)[:, 30:]
@@ -218,8 +219,8 @@ def test_adopted_normals_match_the_twin(rng):
     planes = np.array([[*facing(25, 70), 1.2], [*facing(40, 200), 2.0], [*facing(27, 70), 1.215], [0, 0, 1, -1.5]])
     fits, surface = surface_of(camera, depth)
     before = runtime.to_host(surface).astype(float)
-    fits.adopt(planes, surface)
-    expected = reference.adopted_normals(before, planes, camera, 0.0015, 0.98, 0.01, 1.5)
+    fits.adopt(planes, surface, measured=measured)
+    expected = reference.adopted_normals(before, planes, camera, 0.0015, least_cosine, 0.01, 1.5)
     found = runtime.to_host(surface)
     differ = np.linalg.norm(found[..., :3] - expected, axis=2) > 1e-5
     assert differ.mean() < 0.002  # a pixel at a threshold may fall on either side
@@ -241,6 +242,21 @@ def test_of_two_near_planes_a_surface_adopts_the_one_it_is_on():
     np.testing.assert_allclose(normals, np.broadcast_to(wall[:3], normals.shape), atol=1e-6)
     below = np.abs(runtime.to_host(surface)[310:330, 315:325, :3] - board[:3]).max(2) < 1e-6
     assert below.all()
+
+
+def test_what_is_measured_of_a_plane_feigns_hardly_any_information_along_it(rng):
+    """Kinect-like noise turns its normals by 0.1 to 0.2 rad: those turned most must not be the ones that stay."""
+    depth = 2.0 + 0.0015 * 4.0 * rng.normal(size=(240, 320))
+    wall = np.array([[*facing(0.0), 2.0]])
+    camera = Camera(320, 240, 262.0, 262.0, 159.5, 119.5)
+
+    def feigned(measured):
+        fits, surface = surface_of(camera, depth)
+        fits.adopt(wall, surface, measured=measured)
+        return float((runtime.to_host(surface)[..., 0] ** 2).mean())
+
+    assert feigned(measured=True) < 1e-4
+    assert feigned(measured=False) > 5.0 * feigned(measured=True)
 
 
 def test_without_planes_and_on_none_of_them_normals_stay():

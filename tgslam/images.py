@@ -17,6 +17,7 @@ from tgslam.types import Camera
 
 STEEPEST_RAD = 1.3  # between a surface's normal and the optical axis
 _ADOPTED_COSINE = 0.98  # of a plane's splats, whose tilts are a few degrees
+_ADOPTED_MEASURED_COSINE = 0.8  # of measured normals, which noise turns by 0.1 to 0.2 rad: those turned most feign most
 _ADOPTED_M, _ADOPTED_SIGMAS = 0.01, 1.5
 DEPTH_EDGE = 0.05  # measurements farther apart than this part of their depth lie on different surfaces
 UNGATED = (-1.0, 1.0)  # in place of what `gate_range` returns: T = 0 for a gradient of any length
@@ -198,16 +199,18 @@ class PlaneFits:
             fitting.fit_planes(self._settings, self._blocks, self._radius, self._fits)
         fitting.spread_normals(self._settings, depth_m, self._fits, with_depth, out)
 
-    def adopt(self, planes_c: NDArray[np.float64], surface: np.ndarray) -> None:
+    def adopt(self, planes_c: NDArray[np.float64], surface: np.ndarray, *, measured: bool = False) -> None:
         """Replace normals of surface [H, W, 4] (normal, depth in m) by those of the planes that it lies on.
 
         planes_c: [P, 4] unit normal and offset in m of n . x + d = 0, camera frame, the normal towards the camera. A
         pixel lies on a plane that it is off by no more than 1 cm and 1.5 sigma of the sensor's depth, and 11 degrees.
+        measured: the surface is of a single depth image, not of a rendering; 37 degrees.
         """
         require("surface", surface, (self.camera.height, self.camera.width, alignment.SURFACE))
         if len(planes_c):
+            least_cosine = _ADOPTED_MEASURED_COSINE if measured else _ADOPTED_COSINE
             fitting.adopt_normals(
-                self._settings, runtime.to_device(planes_c), _ADOPTED_COSINE, _ADOPTED_M, _ADOPTED_SIGMAS, surface
+                self._settings, runtime.to_device(planes_c), least_cosine, _ADOPTED_M, _ADOPTED_SIGMAS, surface
             )
 
 

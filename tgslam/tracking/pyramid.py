@@ -176,7 +176,7 @@ def _write_model(level: ModelLevel, pair: _Pair, fits: images.PlaneFits, planes_
     kernels.pack_texture(pair.grey, level.texture)
     kernels.pack_second_derivatives(level.texture)
     fits.write(pair.depth, level.surface)
-    fits.adopt(planes_c, level.surface)
+    fits.adopt(planes_c, level.surface, measured=level.measured)
 
 
 def _sample_for(camera: Camera) -> np.ndarray:
