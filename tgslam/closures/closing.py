@@ -112,7 +112,8 @@ class GraphClosing:
         latest = len(keyframes) - 1
         if self._search is None or planes is None or latest == 0 or latest % self._config.interval:
             return ()
-        sightings: dict[int, Mapping[int, PlaneEstimate]] = {k: planes.seen_from(k) for k in range(latest + 1)}
+        surface_m, seen = self._config.surface_sigma_m, range(latest + 1)
+        sightings: dict[int, Mapping[int, PlaneEstimate]] = {k: planes.seen_from(k, surface_m) for k in seen}
 
         def view(keyframe: int) -> View:
             return View(keyframes[keyframe].depth_m(), _resolved(keyframes[keyframe].plane_ids, planes))

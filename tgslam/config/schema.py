@@ -263,8 +263,8 @@ class ClosureConfig:
     least_turn_rad: float = setting(0.001, 0.0, 1.0)
     robust: str = setting("cauchy", choices=("none", "huber", "cauchy", "dcs"))  # noise of closures and planes
     robust_sigmas: float = setting(3.0, 0.1, 1000.0)  # beyond which an error counts less
-    # Landmarks: by what a surface strays from its plane in one view and not in others. Most of it all views see alike:
-    # that shifts the plane, and no keyframe
+    # By what a surface strays from its plane in one view and not in others. Most of it all views see alike: that shifts
+    # the plane, and no keyframe
     surface_sigma_m: float = setting(0.0003, 1e-5, 1.0)
     relinearise: float = setting(0.02, 0.0, 1.0)  # rad and m; with solver: incremental
     # Structure closures (formulation: closures or both): which keyframes are compared, and what of it becomes an edge

@@ -35,6 +35,7 @@ class PlanarInstance:
         self.keyframes: list[int] = []  # all that saw it, ascending
         self.merged_into: PlanarInstance | None = None
         self.split_from: PlanarInstance | None = None
+        self.part_of: PlanarInstance | None = None  # whose unevenness it is: then it goes by that one's id
         self.unseen = 0  # keyframes since it was last seen
         self.seen_past = False  # views have shown that what stands before a gap in it does not part it
         self.through = 0  # keyframes, one after the other, that see through it

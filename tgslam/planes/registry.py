@@ -17,6 +17,7 @@ from tgslam.planes.known_steps import with_known_steps
 from tgslam.planes.matching import LEAST_SAMPLES, ViewMatching
 from tgslam.planes.segment import PlaneView
 from tgslam.planes.sight import Samples, Sight, Tolerance
+from tgslam.planes.unevenness import is_part
 from tgslam.types import Camera, FloatImage
 
 _SUSPECT_PLANES = 3  # so many contradicted at once, and more than confirmed: the pose is wrong, not the planes
@@ -111,10 +112,10 @@ class PlaneRegistry:
         matching = ViewMatching(samples, self._instances, self._config, self._tolerance)
         corrected = self._match(matching, keyframe)
         seen = self._integrate(matching, keyframe)
-        created = self._confirm(seen, matching)
+        created, levelled = self._confirm(seen, matching)
         removed = self._weigh_contradictions(matching, seen)
         created += self._split(seen)
-        merged = [*self._overrule(matching), *self._merge(seen, samples)]
+        merged = [*levelled, *self._overrule(matching), *self._merge(seen, samples)]
         ids = [self._id_of(owner, keyframe) for owner in matching.owner]
         shrunk = tuple(sorted({instance.id for instance in corrected if instance.id != NO_ID}))
         return Observation(keyframe, np.array(ids, np.int32), tuple(created), tuple(merged), tuple(removed), shrunk)
@@ -188,18 +189,34 @@ class PlaneRegistry:
         self._instances = matching.instances
         return seen
 
-    def _confirm(self, seen: list[PlanarInstance], matching: ViewMatching) -> list[int]:
-        """Candidates that have become PGIs. Those that have not for too long are dropped."""
-        created = []
+    def _confirm(self, seen: list[PlanarInstance], matching: ViewMatching) -> tuple[list[int], list[tuple[int, int]]]:
+        """Candidates that have become PGIs, and (kept, given up) of PGIs that are others' unevenness.
+
+        Candidates that have become neither for too long are dropped.
+        """
+        created, levelled = [], []
         for instance in seen:
+            levelled += self._level(instance)
             reliable = any(matching.segments[piece].reliable for piece in matching.pieces(instance))
-            if instance.id == NO_ID and (reliable or len(instance.keyframes) >= self._needed_views(instance)):
+            waits = instance.id == NO_ID and instance.part_of is None
+            if waits and (reliable or len(instance.keyframes) >= self._needed_views(instance)):
                 created.append(self._name(instance))
         for instance in self._instances:
             instance.unseen += instance not in seen
         limit = self._config.candidate_keyframes
         self._instances = [i for i in self._instances if i.id != NO_ID or i.unseen <= limit]
-        return created
+        return created, levelled
+
+    def _level(self, instance: PlanarInstance) -> list[tuple[int, int]]:
+        """What turns out to be a larger PGI's unevenness goes by that one's id; (kept, given up) if it had its own."""
+        if instance.part_of is not None and _heir(instance) in self._instances:
+            return []
+        instance.part_of = next((i for i in self._instances if is_part(instance, i, self._config)), None)
+        if instance.part_of is None or instance.id == NO_ID:
+            return []
+        given_up, instance.id = instance.id, NO_ID
+        self._absorbed_by[given_up] = instance.part_of.id
+        return [(instance.part_of.id, given_up)]
 
     def _needed_views(self, candidate: PlanarInstance) -> int:
         """Views that make a candidate a PGI: one less where how it stands speaks for it.
@@ -279,9 +296,15 @@ class PlaneRegistry:
 
     def _id_of(self, owner: PlanarInstance | None, keyframe: int) -> int:
         """The id of a segment's instance after this keyframe's merges and splits."""
-        while owner is not None and owner.merged_into is not None:
-            owner = owner.merged_into
         if owner is None:
             return NO_ID
+        owner = _heir(owner)
         split_off = [i.id for i in self._instances if i.split_from is owner and keyframe in i.keyframes]
         return split_off[-1] if split_off and keyframe not in owner.keyframes else owner.id
+
+
+def _heir(instance: PlanarInstance) -> PlanarInstance:
+    """The one under whose id an instance lives on."""
+    while (heir := instance.merged_into or instance.part_of) is not None:
+        instance = heir
+    return instance
