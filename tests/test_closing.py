@@ -35,11 +35,14 @@ class Planes:
         self.views: dict[int, dict] = {}
         self.renamed: dict[int, int] = {}
         self.split: set[int] = set()
+        self.asked_m: set[float] = set()  # by how much surfaces were taken to stray from planes
 
     def resolve(self, plane_id: int) -> int:
         return self.renamed.get(plane_id, plane_id)
 
-    def seen_from(self, keyframe: int, surface_sigma_m: float = 0.0) -> dict:
+    def seen_from(self, keyframe: int, surface_sigma_m: float | None = None) -> dict:
+        if surface_sigma_m is not None:
+            self.asked_m.add(surface_sigma_m)
         return {self.resolve(i): view for i, view in self.views.get(keyframe, {}).items()}
 
     @property
@@ -48,7 +51,7 @@ class Planes:
         return {
             i: SimpleNamespace(
                 keyframes=[k for k in self.views if i in self.seen_from(k)],
-                view=lambda k, surface_sigma_m=0.0, i=i: self.seen_from(k).get(i),
+                view=lambda k, surface_sigma_m, i=i: self.seen_from(k, surface_sigma_m).get(i),
                 split_from=self if i in self.split else None,
             )
             for i in ids
@@ -105,6 +108,12 @@ def test_planes_take_back_most_of_the_drift(formulation: str) -> None:
         after.append(walked(config, seed).error_m())
     assert np.mean(after) < 0.5 * np.mean(before)
     assert all(a < 1.1 * b for a, b in zip(after, before, strict=True))
+
+
+@pytest.mark.parametrize("formulation", ["closures", "landmarks"])
+def test_edges_and_landmarks_ask_how_certain_the_same_views_are(formulation: str) -> None:
+    config = ClosureConfig(**{**vars(CONFIG), "formulation": formulation, "surface_sigma_m": 0.0007})
+    assert walked(config, 0).planes.asked_m == {0.0007}
 
 
 def test_where_everything_is_right_nothing_moves() -> None:
