@@ -269,8 +269,8 @@ class ClosureConfig:
     relinearise: float = setting(0.02, 0.0, 1.0)  # rad and m; with solver: incremental
     # Structure closures (formulation: closures or both): which keyframes are compared, and what of it becomes an edge
     interval: int = setting(4, 1, 1000)  # k of Table 4: at every k-th keyframe
-    min_gap: int = setting(4, 1, 100_000)  # keyframes between the two
-    max_edges: int = setting(5, 1, 100)  # of a keyframe to earlier ones
+    min_gap: int = setting(2, 1, 100_000)  # keyframes between the two: small planes are in view for a few only
+    max_edges: int = setting(10, 1, 100)  # of a keyframe to earlier ones
     min_angle_rad: float = setting(0.35, 0.01, 1.57)  # between the normals of two shared planes
     known_rad: float = setting(0.02, 1e-4, 10.0)  # directions of the motion that are measured no better than this
     known_m: float = setting(0.05, 1e-4, 10.0)  # count as not measured
