@@ -69,6 +69,7 @@ def test_a_buckle_goes_by_its_surfaces_id() -> None:
         _, ids = stage.show(T_cw)
         assert ids[0] == ids[1]
     assert list(stage.registry.instances) == ids[0]
+    assert stage.registry.candidate_count == 0
     assert abs(stage.registry.instances[ids[0][0]].offset_m - 2.0) < 0.002  # its plane is not the buckle's
 
 

@@ -48,6 +48,11 @@ class PlanarInstance:
         self._view_rms_m: Vector = np.zeros(0)
 
     @property
+    def is_candidate(self) -> bool:
+        """Whether it waits for views to make it a PGI."""
+        return self.id == NO_ID and self.part_of is None
+
+    @property
     def normal_w(self) -> Vector:
         """[3] unit, towards the side that it is seen from."""
         return self.plane.normal

@@ -43,7 +43,8 @@ class PlaneRegistry:
     """All PGIs of a run. Ids count up from 0 and are never used again.
 
     A reliable segment that matches nothing is a PGI at once. An ambiguous one is a candidate: it becomes a PGI, with
-    its first keyframe, when further views or a reliable segment confirm it, and is dropped when they do not.
+    its first keyframe, when further views or a reliable segment confirm it, and is dropped when they do not. What is
+    but the unevenness of a larger PGI goes by that one's id, and is kept so that later views find it again.
     """
 
     def __init__(self, config: PlanesConfig, depth_sigma_per_m2: float) -> None:
@@ -69,7 +70,7 @@ class PlaneRegistry:
     @property
     def candidate_count(self) -> int:
         """Ambiguous surfaces that wait for further views."""
-        return sum(instance.id == NO_ID for instance in self._instances)
+        return sum(instance.is_candidate for instance in self._instances)
 
     def resolve(self, plane_id: int) -> int:
         """The id under which a PGI lives on after merges; -1 for one that was removed."""
@@ -198,8 +199,7 @@ class PlaneRegistry:
         for instance in seen:
             levelled += self._level(instance)
             reliable = any(matching.segments[piece].reliable for piece in matching.pieces(instance))
-            waits = instance.id == NO_ID and instance.part_of is None
-            if waits and (reliable or len(instance.keyframes) >= self._needed_views(instance)):
+            if instance.is_candidate and (reliable or len(instance.keyframes) >= self._needed_views(instance)):
                 created.append(self._name(instance))
         for instance in self._instances:
             instance.unseen += instance not in seen
