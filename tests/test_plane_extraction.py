@@ -11,6 +11,7 @@ from tgslam import runtime
 from tgslam.config.schema import PlanesConfig, SyntheticConfig
 from tgslam.datasets.synthetic import SyntheticSource
 from tgslam.plane_fit import CellGrid
+from tgslam.planes import merging
 from tgslam.planes.cells import planar_cells
 from tgslam.planes.extraction import extract_planes
 from tgslam.planes.segment import PlaneView, tangents
@@ -83,6 +84,28 @@ def test_any_plane_is_found_exactly_without_noise(x, y, offset_m):
     view = seen(exact_m, None)
     assert len(view.segments) == 1 and view.segments[0].area_px == exact_m.size
     assert_true(view.segments[0], normal, offset_m, 0.002, 2e-5)
+
+
+def test_without_noise_a_plane_joins_in_a_few_rounds(monkeypatch):
+    """All costs are zero there: each node has several partners that are as cheap."""
+    rounds, partners = [], merging._partners
+    monkeypatch.setattr(merging, "_partners", lambda *args: rounds.append(0) or partners(*args))
+    view = seen(plane_depth(WALL, 2.0), None)
+    assert len(view.segments) == 1
+    assert len(rounds) < 60
+
+
+@given(st.integers(2, 40), st.integers(0, 2**32 - 1))
+def test_of_equally_cheap_partners_none_is_taken_twice(nodes, seed):
+    rng = np.random.default_rng(seed)
+    low, high = np.triu_indices(nodes, 1)
+    chosen = rng.random(len(low)) < 4.0 / nodes
+    low, high = low[chosen], high[chosen]
+    kept = merging._matching(low, high, nodes)
+    assert kept.any() or not len(low)
+    if not kept.all():
+        ends = np.concatenate([low[kept], high[kept]])
+        assert len(np.unique(ends)) == len(ends)
 
 
 def test_errors_are_as_large_as_the_covariance_says():

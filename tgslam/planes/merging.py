@@ -12,6 +12,8 @@ from tgslam.planes.cells import CellGraph
 from tgslam.planes.moments import NOISE, Joints, summed
 
 _OVER_MEDIAN = 2.0  # three standard deviations: the median of chi-square of 3 degrees is 2.4, its 99 % quantile 11.3
+_LEAST_JOINING = 0.25  # nodes of the edges between mutual partners: fewer only where most costs are equal
+_SCATTER = 0x9E3779B1  # odd, 2^32 over the golden ratio: multiples of it are spread out modulo 2^32
 _ABSORBED = 4.0  # a set of so many times the points hardly changes by what it takes in
 
 
@@ -90,10 +92,31 @@ def _partners(moments: Floats, edges: Indices, agreement: Agreement) -> Indices:
     for small, large in ((low, high), (high, low)):
         absorbed = (cost == least[small]) & (size[large] >= _ABSORBED * size[small])
         partner[small[absorbed]] = large[absorbed]
-    mutual = (cost == least[low]) & (cost == least[high])
+    mutual = np.flatnonzero((cost == least[low]) & (cost == least[high]))
+    mutual = mutual[_matching(low[mutual], high[mutual], len(moments))]
     partner[high[mutual]] = low[mutual]
     partner[low[mutual]] = low[mutual]
     return partner
+
+
+def _matching(low: Indices, high: Indices, nodes: int) -> NDArray[np.bool_]:
+    """Which of the edges [E] between mutual partners to join in this round.
+
+    A node has several where costs are equal, and then the later node joins the earlier one. Without noise all costs are
+    zero: of a whole plane only the last node would join in a round, for all others are the earlier one somewhere. Then
+    those edges are taken that come first at both ends, in an arbitrary order.
+    """
+    joining = np.zeros(nodes, np.bool_)
+    joining[high] = True
+    joining[low] = False
+    if _LEAST_JOINING * len(low) <= np.count_nonzero(joining):
+        return np.ones(len(low), np.bool_)
+    order = np.arange(len(low), dtype=np.int64) * _SCATTER % (1 << 32)
+    first = np.full(nodes, 1 << 32)
+    np.minimum.at(first, low, order)
+    np.minimum.at(first, high, order)
+    kept: NDArray[np.bool_] = (order == first[low]) & (order == first[high])
+    return kept
 
 
 def _roots(partner: Indices) -> Indices:
