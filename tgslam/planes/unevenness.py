@@ -10,7 +10,7 @@ from tgslam.config.schema import PlanesConfig
 from tgslam.planes.instance import NO_ID, PlanarInstance
 
 _LARGER = 4.0  # times as large as its part is a surface
-_MOST_ANGLE_RAD = 0.05  # by which parts are turned: what sensor and surface may do to a small fit
+_LEAST_COSINE = float(np.cos(0.05))  # of the angle by which sensor and surface may turn a small fit
 _MOST_CELLS = 0.9  # of a part, that stand off no more than surfaces stray from planes
 _SURROUNDED = 0.65  # share of the cells around a part that are the larger surface: border strips have half of them
 _AROUND_CELLS = 2
@@ -22,9 +22,9 @@ def is_part(small: PlanarInstance, large: PlanarInstance, config: PlanesConfig) 
     By how much surfaces stray from their planes is `join_shift_m`. What is fixed to a wall may be no thicker than that;
     most of it, skirting boards and door frames, ends where the wall does.
     """
-    if large.id == NO_ID or small is large or len(small.support) * _LARGER > len(large.support):
+    if large.id == NO_ID or small is large or small.normal_w @ large.normal_w < _LEAST_COSINE:
         return False
-    if small.normal_w @ large.normal_w < np.cos(_MOST_ANGLE_RAD):
+    if len(small.support) * _LARGER > len(large.support):  # counts cells: for the few that are parallel only
         return False
     cells, _ = small.support.cells()
     centres = small.support.centres(cells)
