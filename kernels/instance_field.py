@@ -6,9 +6,9 @@ come as a table with the code of "no plane" in row 0 and that of id k in row k +
 
 import taichi as ti
 
-from tgslam.kernels.cuda.warp import WARP, warp_sum
 from tgslam.kernels.objective import charbonnier_root, share
 from tgslam.kernels.projection import sigmoid
+from tgslam.kernels.warp import WARP, warp_sum
 
 F1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
 F2 = ti.types.ndarray(dtype=ti.f32, ndim=2)

@@ -6,10 +6,10 @@ kernels go over blocks of Gaussians, a block a thread on the CPU and a warp unde
 
 import taichi as ti
 
-from tgslam.kernels.cuda.warp import WARP, warp_sum
 from tgslam.kernels.objective import share
 from tgslam.kernels.projection import rotation_from_quat
 from tgslam.kernels.simd import exp_neg
+from tgslam.kernels.warp import WARP, warp_sum
 
 F1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
 F2 = ti.types.ndarray(dtype=ti.f32, ndim=2)

@@ -5,7 +5,6 @@ The functions take scalars and Lanes alike, as those of `projection` do.
 
 import taichi as ti
 
-from tgslam.kernels.cuda.warp import WARP, warp_sum
 from tgslam.kernels.projection import (
     BLUR,
     BLUR_DEPTH,
@@ -40,6 +39,7 @@ from tgslam.kernels.projection import (
     sigmoid,
 )
 from tgslam.kernels.simd import LANES, exponential, lanes_kernel
+from tgslam.kernels.warp import WARP, warp_sum
 
 nd = ti.types.ndarray
 POSE_BLOCK = WARP  # Gaussians whose pose gradients one writer sums

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from tests.plane_worlds import Box, looking, shifted
-from tgslam.closures.icp import View
-from tgslam.geometry import inverse
-from tgslam.planes.estimate import PlaneEstimate, tangent_axes
-from tgslam.types import Camera
+from tgslam.camera import Camera
+from tgslam.geometry import inverse, tangent_axes
+from tgslam.graph.structure.icp import View
+from tgslam.planes.estimate import PlaneEstimate
 
 CAMERA = Camera(160, 120, 130.0, 128.0, 79.1, 60.3)
 SIGMA_PER_M2 = 0.0015

@@ -7,9 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam.camera import Camera
 from tgslam.errors import FrameError
 from tgslam.geometry import se3_exp
-from tgslam.types import Camera, Frame, FrameReport, FrameStatus, Gaussians, Matrix4, Plane, Rendering, Trajectory
+from tgslam.types import Frame, FrameReport, FrameStatus, Gaussians, Matrix4, Plane, Rendering, Trajectory
 
 CAMERA = Camera(24, 16, 20.0, 20.0, 11.5, 7.5)
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from tgslam.camera import Camera
 from tgslam.config.schema import PlanesConfig, SyntheticConfig
-from tgslam.datasets.synthetic import SyntheticSource
-from tgslam.geometry import inverse, se3_exp
-from tgslam.planes.registry import Observation, PlaneRegistry
-from tgslam.planes.segment import PlaneSegment, PlaneView, tangents
-from tgslam.types import Camera
+from tgslam.datasets.built_in import SyntheticSource
+from tgslam.geometry import inverse, se3_exp, tangent_axes
+from tgslam.planes.instances.registry import Observation, PlaneRegistry
+from tgslam.planes.segment import PlaneSegment, PlaneView
 
 DEPTH_SIGMA_PER_M2 = 0.0015
 LEAST_AREA_SHARE = 0.004  # of the image that a segment takes
@@ -33,7 +33,7 @@ def segment_of(
     sigma = DEPTH_SIGMA_PER_M2 * points[:, 2] ** 2
     weight = 1.0 / sigma**2
     centroid = weight @ points / weight.sum()
-    first, second = tangents(normal)
+    first, second = tangent_axes(normal)
     u, v = (points - centroid) @ first, (points - centroid) @ second
     design = np.column_stack([v, -u, np.ones(len(u))])
     # Neighbouring pixels err together: as if a sixteenth of them were measured

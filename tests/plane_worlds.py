@@ -7,8 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from tgslam.geometry import inverse, se3_exp
-from tgslam.planes.estimate import PlaneEstimate, tangent_axes
+from tgslam.geometry import inverse, se3_exp, tangent_axes
+from tgslam.planes.estimate import PlaneEstimate
 from tgslam.types import RelativePose
 
 REACH_M = 5.0

@@ -14,7 +14,8 @@ from typing import Any
 
 import pytest
 
-from tgslam.bench.ablation import jobs, table, workers
+from tgslam.bench.ablation import jobs, workers
+from tgslam.bench.ablation import results as table
 from tgslam.bench.ablation.studies import STUDIES, Column, Study, Variant
 from tgslam.cli import main
 from tgslam.config.loader import load

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tests.reference import adam as reference
-from tgslam import runtime
-from tgslam.optim import Adam
+from tgslam.device import runtime
+from tgslam.ops.adam import Adam
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import pytest
 
 from tests.reference import alignment as reference
 from tests.reference.image import sobel
-from tgslam import runtime
+from tgslam.device import runtime
 from tgslam.geometry import se3_exp
 from tgslam.kernels import alignment
 

@@ -16,7 +16,7 @@ import pytest
 
 from tgslam.cli import main
 from tgslam.config.schema import SyntheticConfig
-from tgslam.datasets.synthetic import SyntheticSource
+from tgslam.datasets.built_in import SyntheticSource
 from tgslam.output.trajectory_io import read_trajectory
 from tools.export_synthetic import export
 

@@ -15,15 +15,18 @@ from scipy.optimize import lsq_linear
 
 from tests.counting import LaneArray, arithmetic_of
 from tests.reference import projection as reference
-from tgslam.bench import arithmetic, render, report, scenes
+from tgslam.bench import arithmetic, report
+from tgslam.bench import rasterizer as render
+from tgslam.bench import workloads as scenes
 from tgslam.bench.timing import Samples
+from tgslam.camera import Camera
 from tgslam.cli import main
-from tgslam.gaussian_map import GaussianMap
+from tgslam.device.stopwatch import Stopwatch
 from tgslam.kernels import projection, rasterize
 from tgslam.kernels.simd import ALPHA_MIN, CHUNK, CHUNKS, LANE_X, LANE_Y, LANES, PER_ROW, TILE
-from tgslam.render import Rasterizer
-from tgslam.stopwatch import Stopwatch
-from tgslam.types import Camera, Gaussians
+from tgslam.map.gaussians import GaussianMap
+from tgslam.ops.rasterize import Rasterizer
+from tgslam.types import Gaussians
 
 SMALL = ["--repeats", "2", "--threads", "1", "--quiet"]
 SMALL_ROOM = ["--set", "synthetic.width=64", "--set", "synthetic.height=48", "--set", "mapping.iterations=1"]

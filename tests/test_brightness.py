@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from tgslam.config.schema import SyntheticConfig
-from tgslam.datasets.synthetic import SyntheticSource
+from tgslam.datasets.built_in import SyntheticSource
 from tgslam.geometry import inverse
+from tgslam.map.keyframe import Keyframe
 from tgslam.mapping.brightness import relative_gain
-from tgslam.mapping.keyframe import Keyframe
-from tgslam.tracking.exposure import Exposure
+from tgslam.types import Exposure
 
 
 @pytest.fixture(scope="module")

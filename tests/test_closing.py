@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tests.plane_worlds import Box, odometry, position_errors_m, walking
-from tgslam.closures.closing import Correction, GraphClosing
+from tgslam.camera import Camera
 from tgslam.config.schema import ClosureConfig, Config, LoopConfig, PlanesConfig
 from tgslam.errors import ConfigError
 from tgslam.geometry import inverse, orthonormalized, se3_exp, se3_log
+from tgslam.graph.closing import Correction, GraphClosing
 from tgslam.slam import Slam
-from tgslam.types import Camera
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 SIZE_M = (2.0, 2.4, 16.0)

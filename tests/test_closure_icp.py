@@ -10,13 +10,13 @@ from numpy.testing import assert_allclose
 
 from tests.closure_views import CAMERA, SIGMA_PER_M2, WALK, fits, motion, view
 from tests.reference import closure_icp as reference
-from tgslam import closure_fit, runtime
-from tgslam.closures.candidates import shared_planes
-from tgslam.closures.icp import Registration, View
-from tgslam.closures.relative import measure
 from tgslam.config.schema import ClosureConfig
-from tgslam.geometry import inverse, se3_exp, se3_log
-from tgslam.planes.segment import tangents
+from tgslam.device import runtime
+from tgslam.geometry import inverse, se3_exp, se3_log, tangent_axes
+from tgslam.graph.relative import measure
+from tgslam.graph.structure.candidates import shared_planes
+from tgslam.graph.structure.icp import Registration, View
+from tgslam.ops import closure_icp as closure_fit
 
 CONFIG = ClosureConfig(samples_px=4)
 INTRINSICS = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
@@ -29,7 +29,7 @@ def plane_rows(rng: np.random.Generator, count: int) -> np.ndarray:
     for _ in range(count):
         normal = rng.standard_normal(3)
         normal /= np.linalg.norm(normal)
-        first, second = tangents(normal)
+        first, second = tangent_axes(normal)
         centroid = rng.uniform(1, 2, 3)
         rows.append([*normal, -normal @ centroid, *first, first @ centroid, *second, second @ centroid])
     return np.array(rows)

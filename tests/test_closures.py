@@ -12,13 +12,13 @@ from numpy.testing import assert_allclose
 from tests.closure_views import CAMERA, SIGMA_PER_M2, WALK, fits, motion, view
 from tests.plane_worlds import Box, looking, shifted
 from tests.test_plane_estimate import random_pose
-from tgslam.closures.candidates import candidates
-from tgslam.closures.gating import passes
-from tgslam.closures.relative import PlanePairs, measure, of_planes
-from tgslam.closures.search import ClosureSearch, Findings
 from tgslam.config.schema import ClosureConfig
-from tgslam.geometry import inverse, se3_exp, se3_log
-from tgslam.planes.estimate import PlaneEstimate, stacked, tangent_axes
+from tgslam.geometry import inverse, se3_exp, se3_log, tangent_axes
+from tgslam.graph.gating import passes
+from tgslam.graph.relative import PlanePairs, measure, of_planes
+from tgslam.graph.structure.candidates import candidates
+from tgslam.graph.structure.search import ClosureSearch, Findings
+from tgslam.planes.estimate import PlaneEstimate, stacked
 
 seeds = st.integers(0, 2**32 - 1)
 CONFIG = ClosureConfig()

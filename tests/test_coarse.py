@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tgslam.gaussian_map import GaussianMap
+from tgslam.camera import Camera
+from tgslam.map.gaussians import GaussianMap
+from tgslam.map.keyframe import Keyframe
 from tgslam.mapping.coarse import halved, seen_in_part, seen_whole
-from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.surface import Surface
-from tgslam.render import Rasterizer
-from tgslam.tracking.exposure import Exposure
-from tgslam.types import Camera, Frame, Gaussians
+from tgslam.ops.rasterize import Rasterizer
+from tgslam.types import Exposure, Frame, Gaussians
 
 CAMERA = Camera(80, 60, 60.0, 60.0, 39.5, 29.5)
 WALL_M = 0.6  # to the right of the camera, seen at a grazing angle

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import taichi as ti
 
-from tgslam import runtime
-from tgslam.quick_import import quick_import
+from tgslam.device import runtime
+from tgslam.device.quick_import import quick_import
 
 
 @ti.kernel

@@ -11,14 +11,14 @@ import cv2
 import numpy as np
 import pytest
 
+from tgslam.camera import Camera
 from tgslam.config.schema import DatasetConfig, SyntheticConfig
 from tgslam.datasets import FrameRange, RgbdSource, open_source, parse_frame_slice
-from tgslam.datasets.association import associate_times
 from tgslam.datasets.calibration import Calibration, resolve
-from tgslam.datasets.images import Undistorter
+from tgslam.datasets.image_files import Undistorter
+from tgslam.datasets.time_matching import associate_times
 from tgslam.errors import ConfigError, DatasetError, FrameError
 from tgslam.geometry import inverse, transform_points
-from tgslam.types import Camera
 
 W, H = 64, 48
 TUM = DatasetConfig(format="tum", fx=50.0, fy=51.0, cx=31.0, cy=23.0)

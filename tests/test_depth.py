@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from tests.reference import depth as reference
-from tgslam import depth, runtime
+from tgslam.device import runtime
 from tgslam.kernels import depth as kernels
+from tgslam.ops import depth
 
 SIGMA = 0.0015
 FOCAL_PX = 100.0

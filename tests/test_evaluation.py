@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tgslam.config.schema import DatasetConfig, SyntheticConfig
 from tgslam.datasets import open_source
 from tgslam.errors import EvaluationError
-from tgslam.evaluation import images
+from tgslam.evaluation import image_metrics as images
 from tgslam.evaluation.trajectory import align_se3, associate, ate, rpe
 from tgslam.geometry import inverse, se3_exp, transform_points
 from tgslam.types import Frame, Rendering, Trajectory

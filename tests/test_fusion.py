@@ -10,13 +10,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tgslam.config.schema import LossConfig, MappingConfig, SeedingConfig, SyntheticConfig
-from tgslam.datasets.synthetic import SyntheticSource
+from tgslam.datasets.built_in import SyntheticSource
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, so3_exp, transform_points
+from tgslam.map.keyframe import Keyframe
 from tgslam.mapping.fusion import depth_pyramid, fused_depth, sample, turned
-from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.mapper import Mapper
-from tgslam.tracking.exposure import Exposure
-from tgslam.types import Frame
+from tgslam.types import Exposure, Frame
 
 SIGMA_PER_M2 = LossConfig().depth_sigma_per_m2
 

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tgslam.gaussian_map import PARAMETERS, GaussianMap, MapGradient, grown
+from tgslam.map.gaussians import PARAMETERS, GaussianMap, grown
+from tgslam.ops.splats import MapGradient
 from tgslam.types import Gaussians
 
 FIELDS = tuple(Gaussians.__dataclass_fields__)

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from tgslam import geometry
-from tgslam.types import Camera
+from tgslam.camera import Camera
 
 MAGNITUDES = st.one_of(
     st.floats(0.0, math.pi - 1e-4),

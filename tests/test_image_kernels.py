@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from tests.reference import image as reference
-from tgslam import images, runtime
+from tgslam.camera import Camera
+from tgslam.device import runtime
 from tgslam.kernels import alignment
-from tgslam.types import Camera
+from tgslam.ops import image as images
 
 SIZES = [(48, 64), (37, 51), (2, 3), (700, 5)]
 VGA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)

@@ -7,12 +7,13 @@ import pytest
 
 from tests.reference import instance_field as reference
 from tests.test_loss_kernels import assert_gradient, central
-from tgslam import instance_field, runtime
-from tgslam.bench.ablation import identity
+from tgslam.bench.ablation import identity_study as identity
 from tgslam.config.schema import StructureConfig
+from tgslam.device import runtime
 from tgslam.kernels import instance_field as kernels
-from tgslam.planes import palette
-from tgslam.planes.codes import code_table, codes_of, read_ids
+from tgslam.ops import instance_field
+from tgslam.planes.identity import palette
+from tgslam.planes.identity.codes import code_table, codes_of, read_ids
 
 CONFIG = StructureConfig(lambda_pgi=0.7, scalar_ids=12)
 OTHER = 2.0**-10  # a derivative by opacity that is there before

@@ -7,7 +7,7 @@ import pytest
 
 from tgslam.config.schema import KeyframeConfig
 from tgslam.geometry import se3_exp
-from tgslam.keyframes import KeyframeSelector
+from tgslam.keyframing.covisibility import KeyframeSelector
 from tgslam.types import Frame
 
 CONFIG = KeyframeConfig(min_overlap=0.8, max_unexplained=0.1, max_translation=0.1, max_interval=20)

@@ -10,18 +10,19 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from tgslam.closures.appearance import LoopSearch
-from tgslam.closures.depth_agreement import DepthGrid, agreement
-from tgslam.closures.features import Detector, Features, matches
-from tgslam.closures.retrieval import Retrieval
-from tgslam.closures.search import Findings
-from tgslam.closures.verification import Look, Sameness, Verification
+from tgslam.camera import Camera
 from tgslam.config.schema import ClosureConfig, Config, LoopConfig, SyntheticConfig
-from tgslam.datasets.synthetic import SyntheticSource, synthetic_camera
+from tgslam.datasets.built_in import SyntheticSource, synthetic_camera
 from tgslam.geometry import inverse, se3_exp, se3_log
-from tgslam.pose_graph import PoseGraph
+from tgslam.graph.pose_graph import PoseGraph
+from tgslam.graph.structure.search import Findings
+from tgslam.graph.visual.depth_agreement import DepthGrid, agreement
+from tgslam.graph.visual.features import Detector, Features, matches
+from tgslam.graph.visual.loop_search import LoopSearch
+from tgslam.graph.visual.retrieval import Retrieval
+from tgslam.graph.visual.verification import Look, Sameness, Verification
 from tgslam.synthetic.sensor import DEPTH_SIGMA_PER_M2
-from tgslam.types import Camera, Frame, RelativePose
+from tgslam.types import Frame, RelativePose
 
 CONFIG = LoopConfig()
 CAMERA = synthetic_camera(320, 240)

@@ -7,8 +7,9 @@ import pytest
 
 from tests.reference import image as reference_image
 from tests.reference import loss as reference
-from tgslam import losses, runtime
 from tgslam.config.schema import LossConfig
+from tgslam.device import runtime
+from tgslam.ops import loss as losses
 
 GAIN, BIAS = 1.07, -0.03
 CONFIG = LossConfig(weight_geo=0.1, weight_ssim=0.7, weight_grad=2.0)

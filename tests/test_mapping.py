@@ -17,20 +17,19 @@ from tgslam.config.schema import (
     StructureConfig,
     SyntheticConfig,
 )
-from tgslam.datasets.synthetic import SyntheticSource
-from tgslam.evaluation.images import psnr
+from tgslam.datasets.built_in import SyntheticSource
+from tgslam.device.stopwatch import Stopwatch
+from tgslam.evaluation.image_metrics import psnr
 from tgslam.geometry import inverse, se3_exp, se3_log, transform_points
 from tgslam.kernels.simd import ALPHA_MIN
-from tgslam.mapping.keyframe import Keyframe
+from tgslam.map.keyframe import Keyframe
 from tgslam.mapping.mapper import Mapper
 from tgslam.mapping.refinement import Refiner
 from tgslam.mapping.surface import Projection
-from tgslam.planes.codes import codes_of, read_ids
-from tgslam.render import Rasterizer
-from tgslam.stopwatch import Stopwatch
+from tgslam.ops.rasterize import Rasterizer
+from tgslam.planes.identity.codes import codes_of, read_ids
 from tgslam.synthetic import sensor
-from tgslam.tracking.exposure import Exposure
-from tgslam.types import Frame, Gaussians, Rendering
+from tgslam.types import Exposure, Frame, Gaussians, Rendering
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from tgslam.camera import Camera
 from tgslam.mapping.planar import PlanarPixels
-from tgslam.types import Camera
 
 CAMERA = Camera(64, 48, 100.0, 100.0, 31.5, 23.5)
 HOLE = np.s_[10:20, 30:40]

@@ -14,11 +14,11 @@ from tests.plane_views import Rectangle, Stage, looking
 from tests.plane_worlds import shifted
 from tests.test_plane_estimate import random_plane, random_pose
 from tgslam.config.schema import PlanesConfig
-from tgslam.geometry import inverse, so3_exp, transform_points
-from tgslam.planes.association import Agreement, assign, gate, matching_cost, overlap
-from tgslam.planes.cue import StructureCue
-from tgslam.planes.estimate import PlaneEstimate, tangent_axes
-from tgslam.planes.support import Support
+from tgslam.geometry import inverse, so3_exp, tangent_axes, transform_points
+from tgslam.keyframing.structure_cue import StructureCue
+from tgslam.planes.estimate import PlaneEstimate
+from tgslam.planes.instances.association import Agreement, assign, gate, matching_cost, overlap
+from tgslam.planes.instances.support import Support
 
 CONFIG = PlanesConfig()
 seeds = st.integers(0, 2**32 - 1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tgslam.config.schema import StructureConfig
-from tgslam.planes.codes import codes_of, unmixed
+from tgslam.planes.identity.codes import codes_of, unmixed
 
 CONFIG = StructureConfig()
 

@@ -11,13 +11,13 @@ import trimesh
 from tests.fakes import FakeSystem
 from tests.plane_views import Playback
 from tests.test_plane_outputs import assert_same
-from tgslam.evaluation.planes import plane_errors
+from tgslam.evaluation.plane_metrics import plane_errors
+from tgslam.geometry import tangent_axes
 from tgslam.output.planes_io import read_planes
 from tgslam.output.run_folder import RunFolder
 from tgslam.output.triangulation import signed_area
-from tgslam.planes import palette
-from tgslam.planes.export import planes_of
-from tgslam.planes.segment import tangents
+from tgslam.planes.identity import palette
+from tgslam.planes.instances.export import planes_of
 from tgslam.types import Plane
 
 
@@ -49,7 +49,7 @@ def test_outlines_enclose_about_the_area_and_lie_on_their_planes(planes: tuple[P
     for plane in planes:
         for polygon in plane.polygons_w:
             np.testing.assert_allclose(polygon @ plane.normal_w + plane.offset_m, 0, atol=1e-9)
-        areas = [signed_area(polygon @ tangents(plane.normal_w).T) for polygon in plane.polygons_w]
+        areas = [signed_area(polygon @ tangent_axes(plane.normal_w).T) for polygon in plane.polygons_w]
         assert all(area > 0 for area in areas)  # counter-clockwise from the front
         if plane.area_m2 > 1:
             assert 0.8 < sum(areas) / plane.area_m2 < 2  # holes, where things hide the plane, are filled
@@ -69,5 +69,5 @@ def test_a_run_folder_holds_them_and_gives_them_back(planes: tuple[Plane, ...], 
         assert_same(one, other)
     scene = trimesh.load(folder.planes_mesh)
     assert set(scene.graph.nodes_geometry) == {f"plane {plane.id}" for plane in planes if plane.polygons_w}
-    areas = [signed_area(p @ tangents(plane.normal_w).T) for plane in planes for p in plane.polygons_w]
+    areas = [signed_area(p @ tangent_axes(plane.normal_w).T) for plane in planes for p in plane.polygons_w]
     assert scene.area == pytest.approx(sum(areas), rel=1e-3)

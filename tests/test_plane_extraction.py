@@ -7,15 +7,16 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from tgslam import runtime
+from tgslam.camera import Camera
 from tgslam.config.schema import PlanesConfig, SyntheticConfig
-from tgslam.datasets.synthetic import SyntheticSource
-from tgslam.plane_fit import CellGrid
-from tgslam.planes import merging
-from tgslam.planes.cells import planar_cells
-from tgslam.planes.extraction import extract_planes
-from tgslam.planes.segment import PlaneView, tangents
-from tgslam.types import Camera
+from tgslam.datasets.built_in import SyntheticSource
+from tgslam.device import runtime
+from tgslam.geometry import tangent_axes
+from tgslam.ops.plane_fit import CellGrid
+from tgslam.planes.segment import PlaneView
+from tgslam.planes.segmentation import merging
+from tgslam.planes.segmentation.cells import planar_cells
+from tgslam.planes.segmentation.extraction import extract_planes
 
 SIGMA = 0.0015
 CAMERA = Camera(320, 240, 280.0, 275.0, 158.0, 121.0)
@@ -45,7 +46,7 @@ def seen(
 
 def deviation(segment, normal, offset_m) -> np.ndarray:
     """[3] true plane minus segment, in the coordinates of its covariance."""
-    first, second = tangents(segment.normal_c)
+    first, second = tangent_axes(segment.normal_c)
     return np.array([-second @ normal, first @ normal, -(normal @ segment.centroid_c + offset_m)])
 
 

@@ -6,9 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.reference import planes as reference
-from tgslam import plane_fit, runtime
-from tgslam.planes.moments import Joints, planes_of, squared_residuals
-from tgslam.types import Camera
+from tgslam.camera import Camera
+from tgslam.device import runtime
+from tgslam.ops import plane_fit
+from tgslam.planes.segmentation.moments import Joints, planes_of, squared_residuals
 
 SIGMA = 0.0015
 SIZES = [(24, 32, 8), (31, 17, 8), (13, 45, 5), (3, 2, 4), (1, 1, 8)]

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from tests.plane_views import DEPTH_SIGMA_PER_M2, Rectangle, cast, looking, points_c, segment_of
-from tgslam import runtime
+from tgslam.camera import Camera
 from tgslam.config.schema import PlanesConfig
+from tgslam.device import runtime
 from tgslam.mapping.planar import PlanarMapping
-from tgslam.plane_fit import CellGrid
-from tgslam.planes.cells import planar_cells
-from tgslam.planes.extraction import extract_planes
-from tgslam.planes.layers import bordering, part_layers, settle
-from tgslam.planes.merging import Agreement
-from tgslam.planes.registry import PlaneRegistry
+from tgslam.ops.plane_fit import CellGrid
+from tgslam.planes.instances.registry import PlaneRegistry
 from tgslam.planes.segment import PlaneView
-from tgslam.types import Camera
+from tgslam.planes.segmentation.cells import planar_cells
+from tgslam.planes.segmentation.extraction import extract_planes
+from tgslam.planes.segmentation.layers import bordering, part_layers, settle
+from tgslam.planes.segmentation.merging import Agreement
 
 CAMERA = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
 CONFIG = PlanesConfig()

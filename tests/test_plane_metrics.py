@@ -15,7 +15,7 @@ from tests.test_plane_outputs import FLOOR, ROOM, turned
 from tgslam import pipeline
 from tgslam.config.schema import EvaluationConfig
 from tgslam.datasets.source import FrameRange
-from tgslam.evaluation.planes import (
+from tgslam.evaluation.plane_metrics import (
     FLOATER_KEY,
     INSTANCE_KEYS,
     floater_share,

@@ -23,7 +23,7 @@ from tgslam.output.planes_mesh import write_mesh
 from tgslam.output.ply import SH_C0
 from tgslam.output.run_folder import RunFolder
 from tgslam.output.triangulation import signed_area, triangulate
-from tgslam.planes import palette
+from tgslam.planes.identity import palette
 from tgslam.types import Gaussians, Plane
 
 SVG = "{http://www.w3.org/2000/svg}"

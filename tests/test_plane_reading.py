@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tgslam.camera import Camera
 from tgslam.config.schema import StructureConfig
-from tgslam.planes.outline import Outline
-from tgslam.planes.reading import PlaneReader
-from tgslam.types import Camera, Plane
+from tgslam.planes.identity.outline import Outline
+from tgslam.planes.identity.reading import PlaneReader
+from tgslam.types import Plane
 
 CAMERA = Camera(100, 60, 50.0, 50.0, 49.5, 29.5)
 DEPTH_M = np.full((60, 100), 2.0, np.float32)

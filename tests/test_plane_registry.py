@@ -10,12 +10,12 @@ from numpy.testing import assert_allclose
 
 from tests.plane_views import Playback, Rectangle, Stage, looking
 from tgslam.config.schema import PlanesConfig
-from tgslam.geometry import inverse, se3_exp
-from tgslam.planes.estimate import PlaneEstimate, deviation_sigmas, tangent_axes
-from tgslam.planes.instance import PlanarInstance
-from tgslam.planes.joining import Joining
-from tgslam.planes.palette import colours
-from tgslam.planes.sight import Tolerance
+from tgslam.geometry import inverse, se3_exp, tangent_axes
+from tgslam.planes.estimate import PlaneEstimate, deviation_sigmas
+from tgslam.planes.identity.palette import colours
+from tgslam.planes.instances.instance import PlanarInstance
+from tgslam.planes.instances.joining import Joining
+from tgslam.planes.instances.sight import Tolerance
 
 CLEAR_M = 0.05  # planes of the scenes that stand closer to a parallel one are not told apart for certain
 WALL = Rectangle((0.0, 3.0, 1.25), (1, 0, 0), (0, 0, 1), (5.0, 2.5))

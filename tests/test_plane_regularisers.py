@@ -7,11 +7,12 @@ import pytest
 
 from tests.reference import plane_regularisers as reference
 from tests.test_loss_kernels import assert_gradient, central
-from tgslam import runtime
 from tgslam.config.schema import StructureConfig
-from tgslam.gaussian_map import GaussianMap, MapGradient
+from tgslam.device import runtime
 from tgslam.geometry import matrix_from_quat_wxyz
-from tgslam.plane_regularisers import PlaneRegularisers
+from tgslam.map.gaussians import GaussianMap
+from tgslam.ops.plane_regularisers import PlaneRegularisers
+from tgslam.ops.splats import MapGradient
 from tgslam.types import Gaussians
 
 CONFIG = StructureConfig(lambda_str=0.6, omega_flat=1.3, omega_normal=0.8, omega_distance=0.4, sigma_distance_m=0.01)

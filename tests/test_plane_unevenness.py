@@ -10,8 +10,8 @@ import pytest
 from tests.plane_views import Rectangle, Stage, looking
 from tgslam.config.schema import PlanesConfig
 from tgslam.planes.estimate import PlaneEstimate
-from tgslam.planes.instance import PlanarInstance
-from tgslam.planes.unevenness import is_part
+from tgslam.planes.instances.instance import PlanarInstance
+from tgslam.planes.instances.unevenness import is_part
 
 WALL = Rectangle((0.0, 2.0, 1.25), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (3.0, 2.5))
 VIEWS = [looking((x, 0.5, 1.2), (x + 0.1, 2.0, 1.2)) for x in np.linspace(-0.3, 0.3, 6)]

@@ -14,14 +14,14 @@ from numpy.testing import assert_allclose
 
 from tests.plane_worlds import Box, odometry, position_errors_m, shifted, turning, walking
 from tests.test_plane_estimate import random_plane, random_pose
-from tgslam.closures.candidates import candidates, shared_planes
-from tgslam.closures.gating import passes
-from tgslam.closures.relative import Measurement, measure
 from tgslam.config.schema import ClosureConfig
 from tgslam.errors import GraphError
 from tgslam.geometry import inverse, se3_exp, se3_log
+from tgslam.graph.gating import passes
+from tgslam.graph.pose_graph import GraphEstimate, PoseGraph, _PlaneError
+from tgslam.graph.relative import Measurement, measure
+from tgslam.graph.structure.candidates import candidates, shared_planes
 from tgslam.planes.estimate import PlaneEstimate
-from tgslam.pose_graph import GraphEstimate, PoseGraph, _PlaneError
 from tgslam.types import RelativePose
 
 seeds = st.integers(0, 2**32 - 1)
@@ -373,7 +373,7 @@ def test_a_singular_system_is_a_graph_error_or_solved(monkeypatch: pytest.Monkey
     def fail(*arguments: object) -> None:
         raise RuntimeError("\nIndeterminant linear system detected near variable x1\n")
 
-    monkeypatch.setattr("tgslam.pose_graph._Incremental.update", fail)
+    monkeypatch.setattr("tgslam.graph.pose_graph._Incremental.update", fail)
     with pytest.raises(GraphError, match="Indeterminant linear system"):
         graph.optimise()
     monkeypatch.undo()

@@ -15,11 +15,12 @@ from tests.test_render import (
     make_gaussians,
     random_gaussians,
 )
-from tgslam import runtime
-from tgslam.gaussian_map import PARAMETERS, GaussianMap, MapGradient
+from tgslam.device import runtime
 from tgslam.kernels import projection
 from tgslam.kernels.simd import LANES, Lanes, exponential, lanes_kernel
-from tgslam.render import Rasterizer
+from tgslam.map.gaussians import PARAMETERS, GaussianMap
+from tgslam.ops.rasterize import Rasterizer
+from tgslam.ops.splats import MapGradient
 from tgslam.types import Gaussians
 
 COUNTS = (1, LANES - 1, LANES, LANES + 1, 2 * LANES + 1)

@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 
 from tests.reference import image as reference
-from tgslam import images, runtime
+from tgslam.camera import Camera
 from tgslam.config.schema import LossConfig
+from tgslam.device import runtime
 from tgslam.kernels import alignment
-from tgslam.render import RenderImages
+from tgslam.ops import image as images
+from tgslam.ops.rasterize import RenderImages
 from tgslam.tracking.pyramid import LivePyramid, ModelPyramid
-from tgslam.types import Camera, Frame
+from tgslam.types import Frame
 
 LOSS = LossConfig()
 LEVELS = 2

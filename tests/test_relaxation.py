@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 
 from tests.reference import relaxation as reference
-from tgslam import runtime
-from tgslam.gaussian_map import GaussianMap, MapGradient
+from tgslam.camera import Camera
+from tgslam.device import runtime
 from tgslam.kernels import relaxation
 from tgslam.kernels.objective import PIXELS, TOTALS
-from tgslam.render import ImageGradient, Rasterizer
-from tgslam.types import Camera, Gaussians
+from tgslam.map.gaussians import GaussianMap
+from tgslam.ops.rasterize import ImageGradient, Rasterizer
+from tgslam.ops.splats import MapGradient
+from tgslam.types import Gaussians
 
 CAMERA = Camera(40, 32, 60.0, 60.0, 19.5, 15.5)
 STEP, FLOOR = 0.7, 2.0

@@ -12,12 +12,14 @@ import pytest
 
 from tests.reference.projection import NAMES, Parameters, parameters, project
 from tests.reference.rasterize import Derivatives, Images, decisions_at, render, undecided
-from tgslam.gaussian_map import GaussianMap, MapGradient
+from tgslam.camera import Camera
 from tgslam.geometry import se3_exp
 from tgslam.kernels.projection import BLUR
 from tgslam.kernels.simd import ALPHA_MIN, T_MIN
-from tgslam.render import MIN_OPACITY, ImageGradient, Rasterizer
-from tgslam.types import Camera, Gaussians
+from tgslam.map.gaussians import GaussianMap
+from tgslam.ops.rasterize import MIN_OPACITY, ImageGradient, Rasterizer
+from tgslam.ops.splats import MapGradient
+from tgslam.types import Gaussians
 
 BAND = 1e-4  # relative; float32 offsets of some 50 px leave errors of up to 1e-5 in alpha
 ATOL = 2e-4

@@ -8,12 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.reference import rigid as reference
-from tgslam import runtime
-from tgslam.gaussian_map import GaussianMap
+from tgslam.camera import Camera
+from tgslam.device import runtime
 from tgslam.geometry import inverse, quat_wxyz_from_matrices, se3_exp
 from tgslam.kernels import rigid
-from tgslam.render import Rasterizer
-from tgslam.types import Camera, Gaussians
+from tgslam.map.gaussians import GaussianMap
+from tgslam.ops.rasterize import Rasterizer
+from tgslam.types import Gaussians
 
 CAMERA = Camera(48, 40, 60.0, 60.0, 23.5, 19.5)
 

@@ -14,8 +14,8 @@ import pytest
 from tests.fakes import CAMERA
 from tgslam.config.loader import load
 from tgslam.errors import OutputError
-from tgslam.output.atomic import atomic_file, write_text
-from tgslam.output.images import write_colour, write_depth, write_depth_colours
+from tgslam.files.atomic import atomic_file, write_text
+from tgslam.output.pictures import write_colour, write_depth, write_depth_colours
 from tgslam.output.run_folder import RunFolder, RunRecord, RunState, fresh_folder
 
 RECORD = RunRecord("0.1.0", RunState.RUNNING, "fake", None, (None, 10, None), CAMERA)

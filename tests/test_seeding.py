@@ -9,15 +9,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tests.reference.seeding import cell_measures
-from tgslam import images, runtime
+from tgslam.camera import Camera
 from tgslam.config.schema import SeedingConfig, SyntheticConfig
-from tgslam.datasets.synthetic import SyntheticSource
-from tgslam.evaluation.images import masked_psnr
+from tgslam.datasets.built_in import SyntheticSource
+from tgslam.device import runtime
+from tgslam.evaluation.image_metrics import masked_psnr
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, se3_exp, transform_points
 from tgslam.kernels import seeding as kernels
-from tgslam.mapping.seeding import Cells, cell_levels, cell_sizes, quadtree, seed
-from tgslam.render import Rasterizer
-from tgslam.types import Camera, Frame, Gaussians
+from tgslam.mapping.insertion import Cells, cell_levels, cell_sizes, quadtree, seed
+from tgslam.ops import image as images
+from tgslam.ops.rasterize import Rasterizer
+from tgslam.types import Frame, Gaussians
 
 SIGMA = 0.0015
 CAMERA = Camera(96, 72, 80.0, 80.0, 47.5, 35.5)

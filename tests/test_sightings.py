@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam import runtime
+from tgslam.device import runtime
 from tgslam.kernels.objective import PIXELS, TOTALS
 from tgslam.mapping.sightings import Sightings
 

@@ -12,12 +12,12 @@ import pytest
 from tgslam.config.loader import load
 from tgslam.config.schema import Config, SyntheticConfig
 from tgslam.datasets import FrameRange, RgbdSource, open_source
-from tgslam.datasets.synthetic import SyntheticSource
+from tgslam.datasets.built_in import SyntheticSource
 from tgslam.errors import FrameError
 from tgslam.evaluation.protocol import held_out_poses, image_metrics
 from tgslam.evaluation.trajectory import ate
 from tgslam.geometry import inverse
-from tgslam.render import Rasterizer
+from tgslam.ops.rasterize import Rasterizer
 from tgslam.slam import Slam
 from tgslam.types import Frame, FrameReport, FrameStatus, Gaussians, Trajectory
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tgslam.camera import Camera
 from tgslam.config.schema import PlanesConfig
 from tgslam.geometry import inverse, se3_exp
-from tgslam.mapping.keyframe import Keyframe
+from tgslam.map.keyframe import Keyframe
 from tgslam.mapping.planar import PlanarMapping
-from tgslam.tracking.exposure import Exposure
-from tgslam.types import Camera, Frame
+from tgslam.types import Exposure, Frame
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
 SIGMA_PER_M2 = 0.0015

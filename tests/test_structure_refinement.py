@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tgslam import runtime
 from tgslam.config.schema import (
     LossConfig,
     MappingConfig,
@@ -16,17 +15,18 @@ from tgslam.config.schema import (
     StructureConfig,
     SyntheticConfig,
 )
-from tgslam.datasets.synthetic import SyntheticSource
-from tgslam.gaussian_map import PARAMETERS, GaussianMap
+from tgslam.datasets.built_in import SyntheticSource
+from tgslam.device import runtime
 from tgslam.geometry import inverse
-from tgslam.mapping.keyframe import Keyframe
+from tgslam.map.gaussians import PARAMETERS, GaussianMap
+from tgslam.map.keyframe import Keyframe
+from tgslam.mapping.insertion import quadtree, seed
 from tgslam.mapping.refinement import Refiner
-from tgslam.mapping.seeding import quadtree, seed
-from tgslam.planes import palette
-from tgslam.planes.codes import codes_of, initial_theta, read_ids
-from tgslam.planes.registry import PlaneRegistry
-from tgslam.planes.table import PlaneTable
-from tgslam.tracking.exposure import Exposure
+from tgslam.planes.identity import palette
+from tgslam.planes.identity.codes import codes_of, initial_theta, read_ids
+from tgslam.planes.instances.plane_table import PlaneTable
+from tgslam.planes.instances.registry import PlaneRegistry
+from tgslam.types import Exposure
 
 CONFIG = StructureConfig()
 VIEWS = (0, 20)

@@ -9,11 +9,12 @@ import pytest
 
 from tests.fakes import FakeSource, FakeSystem
 from tests.plane_views import Rectangle, cast, looking
+from tgslam.camera import Camera
 from tgslam.errors import FrameError
 from tgslam.evaluation.panoptic import IdentitySwitches, overlaps, shown
-from tgslam.evaluation.surfaces import SURFACE_KEY, SurfaceSwitches, patches_of, surface_metrics
+from tgslam.evaluation.surface_switches import SURFACE_KEY, SurfaceSwitches, patches_of, surface_metrics
 from tgslam.geometry import inverse
-from tgslam.types import Camera, Frame
+from tgslam.types import Frame
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 79.5, 59.5)
 WALL = Rectangle((0.0, 2.0, 1.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (4.0, 2.0))

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 from tests.test_synthetic import points_c, source
 from tgslam.geometry import transform_points
 from tgslam.kernels import procedural
+from tgslam.synthetic.primitives import plane_areas_m2, surface_distance_m
 from tgslam.synthetic.scene import Material, Scene, SceneBuilder
-from tgslam.synthetic.surfaces import plane_areas_m2, surface_distance_m
 
 GREY = Material(procedural.PLAIN, (0.5, 0.5, 0.5))
 STEP_M = 0.004  # of the samples

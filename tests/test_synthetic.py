@@ -10,19 +10,20 @@ import numpy as np
 import pytest
 
 from tests.reference import raycast as reference
+from tgslam.camera import Camera
 from tgslam.config.loader import load
 from tgslam.config.schema import DatasetConfig, SyntheticConfig
 from tgslam.datasets import open_source
-from tgslam.datasets.synthetic import SyntheticSource
+from tgslam.datasets.built_in import SyntheticSource
 from tgslam.datasets.tum import open_tum
 from tgslam.errors import ConfigError
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, se3_log, transform_points
 from tgslam.kernels import procedural
 from tgslam.synthetic import corridor, sensor
-from tgslam.synthetic.raycast import Raycaster, camera_scene
+from tgslam.synthetic.ray_casting import Raycaster, camera_scene
 from tgslam.synthetic.scene import Lighting, Material, SceneBuilder
 from tgslam.synthetic.scenes import SCENES
-from tgslam.types import Camera, Trajectory
+from tgslam.types import Trajectory
 from tools import export_synthetic
 
 SMALL = SyntheticConfig(width=100, height=76, frames=400, noise=False)

@@ -12,16 +12,17 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 
 from tests.reference import alignment as reference
-from tgslam import runtime
+from tgslam.camera import Camera
 from tgslam.config.schema import Config, LossConfig, SyntheticConfig, TrackingConfig
-from tgslam.datasets.synthetic import SyntheticSource
-from tgslam.gaussian_map import GaussianMap
+from tgslam.datasets.built_in import SyntheticSource
+from tgslam.device import runtime
 from tgslam.geometry import inverse, se3_exp, se3_log
 from tgslam.kernels import alignment
-from tgslam.mapping.keyframe import Keyframe
+from tgslam.map.gaussians import GaussianMap
+from tgslam.map.keyframe import Keyframe
 from tgslam.mapping.mapper import Mapper
-from tgslam.render import RenderImages
-from tgslam.tracking.exposure import Exposure, IntensityMoments, fit_exposure
+from tgslam.ops.rasterize import RenderImages
+from tgslam.tracking.exposure import IntensityMoments, fit_exposure
 from tgslam.tracking.first_order import FirstOrderTracker
 from tgslam.tracking.gauss_newton import GaussNewtonTracker
 from tgslam.tracking.lost import LostDetector
@@ -30,7 +31,7 @@ from tgslam.tracking.pyramid import LiveLevel, LivePyramid, ModelLevel, ModelPyr
 from tgslam.tracking.reference import NO_PLANES, Reference, references_of
 from tgslam.tracking.result import TrackingResult
 from tgslam.tracking.solver import make_tracker, track_or_recover
-from tgslam.types import Camera, Frame
+from tgslam.types import Exposure, Frame
 
 CONFIG = TrackingConfig()
 PATIENT = replace(CONFIG, solver="first_order", first_order_iterations=(60, 60), first_order_rate=0.002)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tgslam.vector_adam import VectorAdam
+from tgslam.ops.vector_adam import VectorAdam
 
 RATES = [0.1, 0.01, 0.001]
 

@@ -136,3 +136,11 @@ def transform_points(T_ab: ArrayLike, points_b: ArrayLike) -> Array:
     """Map points [..., 3] m from frame b to frame a."""
     T = np.asarray(T_ab, np.float64)
     return np.asarray(points_b, np.float64) @ T[:3, :3].T + T[:3, 3]
+
+
+def tangent_axes(normal: Array) -> Array:
+    """Unit tangents [..., 2, 3] of unit normals [..., 3], right-handed with them: what planes' covariances speak of."""
+    helper = np.eye(3)[np.argmin(np.abs(normal), axis=-1)]
+    first = np.cross(helper, normal)
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    return np.stack([first, np.cross(normal, first)], axis=-2)

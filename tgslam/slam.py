@@ -11,25 +11,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam import runtime
+from tgslam.camera import Camera
 from tgslam.config.schema import Config
-from tgslam.depth import measured_share, without_flying_pixels, without_range_limit
+from tgslam.device import runtime
 from tgslam.errors import ConfigError, FrameError, GraphError
 from tgslam.geometry import inverse, orthonormalized
-from tgslam.keyframes import KeyframeSelector
+from tgslam.keyframing.covisibility import KeyframeSelector
+from tgslam.keyframing.structure_cue import StructureCue
+from tgslam.map.keyframe import Keyframe
 from tgslam.mapping.brightness import relative_gain
-from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.mapper import Mapper
-from tgslam.planes.cue import StructureCue
-from tgslam.tracking.exposure import Exposure
+from tgslam.ops.depth import measured_share, without_flying_pixels, without_range_limit
 from tgslam.tracking.motion import MotionFilter
 from tgslam.tracking.reference import NO_PLANES, Reference, references_of
 from tgslam.tracking.result import TrackingResult
 from tgslam.tracking.solver import make_tracker, track_or_recover
-from tgslam.types import Camera, Frame, FrameReport, FrameStatus, Gaussians, Plane, Trajectory
+from tgslam.types import Exposure, Frame, FrameReport, FrameStatus, Gaussians, Plane, Trajectory
 
 if TYPE_CHECKING:
-    from tgslam.closures.closing import GraphClosing
+    from tgslam.graph.closing import GraphClosing
 
 _MIN_DEPTH_SHARE = 0.01  # a frame with depth in fewer of its pixels is not usable
 _FALLBACKS = 3  # latest keyframes from which a lost camera is sought
@@ -116,7 +116,7 @@ class Slam:
         """The persistent planes by id, empty when planes are not looked for."""
         if not self.mapper.planes:
             return ()
-        from tgslam.planes.export import (
+        from tgslam.planes.instances.export import (
             planes_of,  # here, as `Mapper` loads the rest of planes only where they are used
         )
 
@@ -253,7 +253,7 @@ def _closing(camera: Camera, config: Config) -> GraphClosing | None:
         return None
     if config.closures.enabled and not config.planes.enabled:
         raise ConfigError("closures.enabled needs planes: set planes.enabled=true as well")
-    from tgslam.closures.closing import GraphClosing
+    from tgslam.graph.closing import GraphClosing
 
     return GraphClosing(camera, config.loss.depth_sigma_per_m2, config.closures, config.loops)
 

@@ -1,8 +1,8 @@
-"""Plain data shared by every layer: camera, frame, trajectory. NumPy only."""
+"""Plain data shared by every layer: frame, trajectory, Gaussians, plane. NumPy only."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -13,38 +13,6 @@ Matrix4 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Camera:
-    """A pinhole camera without distortion: u = fx x/z + cx, pixel centres at integers, fx and fy positive."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-    def halved(self, times: int = 1) -> Camera:
-        """The camera of an image whose 2x2 pixel blocks are averaged `times` times (odd rows and columns dropped)."""
-        camera = self
-        for _ in range(times):
-            camera = replace(
-                camera,
-                width=camera.width // 2,
-                height=camera.height // 2,
-                fx=camera.fx / 2,
-                fy=camera.fy / 2,
-                cx=(camera.cx - 0.5) / 2,
-                cy=(camera.cy - 0.5) / 2,
-            )
-        return camera
-
-    def rays(self) -> NDArray[np.float64]:
-        """[H, W, 3] what each pixel looks along, in the camera's frame, with z = 1."""
-        v, u = np.mgrid[: self.height, : self.width]
-        return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones(u.shape)], -1)
-
-
-@dataclass(frozen=True)
 class Frame:
     """One RGB-D image pair. It carries no pose: ground truth stays out of the system's reach."""
 
@@ -52,6 +20,18 @@ class Frame:
     timestamp_s: float
     colour: FloatImage  # [H, W, 3] RGB in [0, 1], sRGB as stored
     depth_m: FloatImage  # [H, W] z in metres, 0 = no measurement
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """map intensity = gain * frame intensity + bias."""
+
+    gain: float = 1.0
+    bias: float = 0.0
+
+    def relative_to(self, other: Exposure) -> Exposure:
+        """That of the same frame against another frame's image, whose exposure is `other`."""
+        return Exposure(self.gain / other.gain, (self.bias - other.bias) / other.gain)
 
 
 @dataclass(frozen=True)

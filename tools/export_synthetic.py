@@ -6,15 +6,15 @@ import argparse
 import sys
 from pathlib import Path
 
+from tgslam.camera import Camera
 from tgslam.config.loader import load
 from tgslam.config.schema import SyntheticConfig
-from tgslam.datasets.synthetic import SyntheticSource
+from tgslam.datasets.built_in import SyntheticSource
 from tgslam.errors import OutputError, TgslamError
-from tgslam.output.atomic import write_text
-from tgslam.output.images import DEPTH_SCALE, write_colour, write_depth
+from tgslam.files.atomic import write_text
+from tgslam.output.pictures import DEPTH_SCALE, write_colour, write_depth
 from tgslam.output.trajectory_io import write_trajectory
 from tgslam.synthetic.scenes import SCENES
-from tgslam.types import Camera
 
 CAMERA_FILE = "camera.yaml"
 

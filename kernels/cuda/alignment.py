@@ -26,8 +26,8 @@ from tgslam.kernels.alignment import (
     reprojected,
 )
 from tgslam.kernels.cuda.block import BLOCK
-from tgslam.kernels.cuda.warp import WARP, warp_sum
 from tgslam.kernels.simd import LANES
+from tgslam.kernels.warp import WARP, warp_sum
 
 _MAX_WARPS = 1024  # a thread takes several pixels of a larger image: summing over a warp costs as much as a pixel
 

@@ -2,7 +2,7 @@
 
 import taichi as ti
 
-from tgslam.kernels.cuda.warp import ALL, WARP
+from tgslam.kernels.warp import ALL, WARP
 
 BLOCK = 256  # threads
 WARPS = BLOCK // WARP

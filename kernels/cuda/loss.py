@@ -7,7 +7,6 @@ partial sums, and one block for each sum adds them up in a fixed order: nothing 
 import taichi as ti
 
 from tgslam.kernels.cuda.block import BLOCK, WARPS
-from tgslam.kernels.cuda.warp import WARP, warp_sum
 from tgslam.kernels.objective import (
     BIAS,
     DEPTHS,
@@ -29,6 +28,7 @@ from tgslam.kernels.objective import (
     share,
     ssim_slopes,
 )
+from tgslam.kernels.warp import WARP, warp_sum
 
 F1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
 F2 = ti.types.ndarray(dtype=ti.f32, ndim=2)

@@ -10,9 +10,9 @@ import taichi as ti
 
 from tgslam.kernels.blending import least_exponent, raw_alpha, tangent_depth
 from tgslam.kernels.cuda.block import BLOCK, WARPS
-from tgslam.kernels.cuda.warp import ALL, WARP, sums_of_4, sums_of_16
 from tgslam.kernels.projection import EMBEDDING, FADE, INV_Z, M_EMBEDDING, QA, QB, QC, RED, SPLAT, ZU, ZV, U, V, Z
 from tgslam.kernels.simd import ALPHA_MAX, ALPHA_MIN, REACH, T_MIN, TILE
+from tgslam.kernels.warp import ALL, WARP, sums_of_4, sums_of_16
 
 nd = ti.types.ndarray
 

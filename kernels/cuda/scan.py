@@ -3,7 +3,7 @@
 import taichi as ti
 
 from tgslam.kernels.cuda.block import BLOCK, WARPS, prefix_in_block
-from tgslam.kernels.cuda.warp import WARP, warp_sum
+from tgslam.kernels.warp import WARP, warp_sum
 
 nd = ti.types.ndarray
 vec6 = ti.types.vector(6, ti.f32)

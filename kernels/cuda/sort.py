@@ -8,7 +8,7 @@ that come from an earlier chunk or stand before it in its own.
 import taichi as ti
 
 from tgslam.kernels.cuda.block import BLOCK, WARPS, prefix_in_block
-from tgslam.kernels.cuda.warp import ALL, WARP
+from tgslam.kernels.warp import ALL, WARP
 
 nd = ti.types.ndarray
 

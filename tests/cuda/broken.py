@@ -10,7 +10,7 @@ import numpy as np
 import taichi as ti
 
 from tests.cuda.harness import scenario
-from tgslam import runtime
+from tgslam.device import runtime
 
 N, BLOCK = 1024, 128  # an array of N floats is a whole page: what lies beyond is out of bounds
 F1 = ti.types.ndarray(ti.f32, ndim=1)

@@ -9,7 +9,7 @@ import pytest
 
 from tests.cuda.harness import Devices
 from tools.cudacheck.environment import Grid, require_platform
-from tools.cudacheck.errors import MissingToolError
+from tools.cudacheck.failures import MissingToolError
 
 
 @pytest.fixture(scope="session")

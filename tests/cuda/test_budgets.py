@@ -7,7 +7,7 @@ import pytest
 from tests.cuda.harness import Devices
 from tools.cudacheck.budgets import BUDGETS_FILE, load_budgets, violations
 from tools.cudacheck.environment import require_program
-from tools.cudacheck.errors import MissingToolError
+from tools.cudacheck.failures import MissingToolError
 
 pytestmark = pytest.mark.cuda_check
 

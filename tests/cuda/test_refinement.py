@@ -7,7 +7,7 @@ import pytest
 
 from tests.cuda.harness import GRIDS, Devices
 from tests.cuda.scenarios import refinement
-from tgslam.gaussian_map import PARAMETERS
+from tgslam.map.gaussians import PARAMETERS
 from tools.cudacheck.environment import Grid
 
 pytestmark = [pytest.mark.cuda_check, pytest.mark.parametrize("grid", GRIDS)]

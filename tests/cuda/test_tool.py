@@ -12,7 +12,7 @@ import pytest
 
 from tools.cudacheck.budgets import Budget, load_budgets, table, violations, with_headroom, write_budgets
 from tools.cudacheck.environment import CACHE_VARIABLE, driver_folder, require_platform, require_program
-from tools.cudacheck.errors import CudaCheckError, MissingToolError
+from tools.cudacheck.failures import CudaCheckError, MissingToolError
 from tools.cudacheck.ptxas import Usage, kernel_of, parse_report
 
 pytestmark = pytest.mark.cuda_check

@@ -14,7 +14,7 @@ import pytest
 
 from tools.cudacheck import ptx
 from tools.cudacheck.environment import driver_folder, environment, require_platform, require_program
-from tools.cudacheck.errors import MissingToolError, UnsupportedPtxError
+from tools.cudacheck.failures import MissingToolError, UnsupportedPtxError
 from tools.cudacheck.translator import translate
 
 pytestmark = pytest.mark.cuda_check

@@ -11,7 +11,7 @@ import traceback
 import numpy as np
 import taichi as ti
 
-from tgslam import runtime
+from tgslam.device import runtime
 
 
 def main(device: str, descriptor: str) -> int:

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam.camera import Camera
 from tgslam.geometry import matrix_from_quat_wxyz, transform_points
 from tgslam.kernels.projection import BLUR, BLUR_DEPTH, EDGE, NEAR_M
-from tgslam.types import Camera, Gaussians
+from tgslam.types import Gaussians
 
 Array = NDArray[np.float64]
 Parameters = dict[str, Array]

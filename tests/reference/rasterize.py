@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.reference.projection import Array, Parameters, Splats, project
+from tgslam.camera import Camera
 from tgslam.geometry import se3_exp
 from tgslam.kernels.simd import ALPHA_MAX, ALPHA_MIN
-from tgslam.types import Camera
 
 
 @dataclass(frozen=True)

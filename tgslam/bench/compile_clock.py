@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tgslam.quick_import import quick_import
+from tgslam.device.quick_import import quick_import
 
 with quick_import():
     from taichi._lib import core

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import tgslam
-from tgslam import runtime
-from tgslam.bench.ablation import table
-from tgslam.bench.run import CACHES
+from tgslam.bench.ablation import results as table
+from tgslam.bench.whole_run import CACHES
+from tgslam.device import runtime
 from tgslam.output.console import print_columns
 
 _CPU_INFO = Path("/proc/cpuinfo")

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from tgslam import runtime
-from tgslam.stopwatch import Stopwatch
+from tgslam.device import runtime
+from tgslam.device.stopwatch import Stopwatch
 
 REST = "rest"  # what the stages leave of the whole
 

@@ -8,10 +8,10 @@ from tgslam import pipeline
 from tgslam.bench.timing import Samples, summary_ms
 from tgslam.config.schema import Config
 from tgslam.datasets.source import RgbdSource
+from tgslam.device.stopwatch import Stopwatch
 from tgslam.errors import FrameError, TrackingError
 from tgslam.output.progress import FrameObserver
 from tgslam.slam import Slam
-from tgslam.stopwatch import Stopwatch
 from tgslam.types import FrameReport, FrameStatus
 
 WARM_UP = 2  # tracked frames: the first one compiles

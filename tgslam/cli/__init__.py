@@ -12,7 +12,8 @@ from collections.abc import Sequence
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # stdout is for results; read when taichi is imported
 
 from tgslam import __version__
-from tgslam.cli import bench, doctor, evaluate, render, run
+from tgslam.cli import benchmark as bench
+from tgslam.cli import doctor, evaluate, render, run
 from tgslam.cli.options import add_log_options
 from tgslam.errors import TgslamError
 from tgslam.output.console import error_console, set_up_logging

@@ -9,16 +9,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tgslam.bench.ablation import table
+from tgslam.bench.ablation import results as table
 from tgslam.bench.ablation.jobs import Case, Input, Job, jobs_of, plan, require_effect
 from tgslam.bench.ablation.studies import STUDIES, Study, keys_of
 from tgslam.cli import engine
 from tgslam.cli.inputs import open_frames, parse_frames, resolve_config
 from tgslam.cli.options import add_thread_count, natural, positive, size
 from tgslam.errors import ConfigError
-from tgslam.output.atomic import write_text
+from tgslam.files.atomic import write_text
 from tgslam.output.console import error_console
-from tgslam.output.images import write_colour
+from tgslam.output.pictures import write_colour
 from tgslam.output.progress import step_progress
 
 _IDENTITY = "identity"
@@ -169,8 +169,8 @@ def _run(args: argparse.Namespace, jobs: Sequence[Job], failures: dict[Path, str
 
 def _measure_identity(args: argparse.Namespace, scene: str) -> dict[str, Any]:
     """Fig. 6 on one frame; its picture goes into the output folder."""
-    from tgslam.bench.ablation import identity
-    from tgslam.runtime import available_threads
+    from tgslam.bench.ablation import identity_study as identity
+    from tgslam.device.runtime import available_threads
 
     threads = args.threads or available_threads()
     engine.start_device("cpu", threads)

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from tgslam import __version__
+from tgslam.camera import Camera
 from tgslam.cli import engine
 from tgslam.errors import DeviceError
 from tgslam.output.console import print_table
-from tgslam.types import Camera, Gaussians
+from tgslam.types import Gaussians
 
 _DISTRIBUTIONS = ("taichi", "numpy", "opencv-python-headless", "scipy", "PyYAML", "rich", "trimesh", "gtsam")
 _EXTRAS = {"test": ("pytest", "hypothesis", "evo", "plyfile", "ruff", "mypy")}  # extra: modules that it brings

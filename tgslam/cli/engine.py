@@ -10,12 +10,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam.camera import Camera
 from tgslam.config.schema import Config
-from tgslam.evaluation.planes import ReadIds
+from tgslam.device.quick_import import quick_import
+from tgslam.evaluation.plane_metrics import ReadIds
 from tgslam.evaluation.protocol import Render
 from tgslam.pipeline import System
-from tgslam.quick_import import quick_import
-from tgslam.types import Camera, Gaussians, Matrix4, Plane
+from tgslam.types import Gaussians, Matrix4, Plane
 
 
 def add_device_option(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +29,7 @@ def add_device_option(parser: argparse.ArgumentParser) -> None:
 def start_device(name: str, threads: int = 0) -> str:
     """Start the kernels on device `name` and return the one in use; 0 threads = all cores. Raises DeviceError."""
     with quick_import():
-        from tgslam.runtime import Device, start
+        from tgslam.device.runtime import Device, start
 
     with contextlib.redirect_stdout(io.StringIO()):  # Taichi prints a line that belongs to no result
         return start(Device(name), threads).value
@@ -44,22 +45,22 @@ def make_system(camera: Camera, config: Config) -> System:
 
 def make_render(camera: Camera) -> Render:
     """The function that renders a map for `camera`."""
-    from tgslam.render import Rasterizer
+    from tgslam.ops.rasterize import Rasterizer
 
     return Rasterizer(camera).render
 
 
 def make_read_ids(camera: Camera, planes: Sequence[Plane], config: Config) -> ReadIds:
     """The function that reads for `camera` which of the planes a map shows, off its rendered embedding."""
-    from tgslam.gaussian_map import GaussianMap
-    from tgslam.planes.reading import PlaneReader
-    from tgslam.render import Rasterizer
+    from tgslam.ops.rasterize import Rasterizer
+    from tgslam.ops.splats import FixedSplats
+    from tgslam.planes.identity.reading import PlaneReader
 
     rasterizer = Rasterizer(camera)
     reader = PlaneReader(camera, planes, config.structure, config.loss.depth_sigma_per_m2)
 
     def read(gaussians: Gaussians, T_cw: Matrix4) -> NDArray[np.int32]:
-        images = rasterizer.forward(GaussianMap.from_gaussians(gaussians), T_cw, with_embedding=True)
+        images = rasterizer.forward(FixedSplats.of(gaussians), T_cw, with_embedding=True)
         return reader.read(images, T_cw)
 
     return read

@@ -11,10 +11,10 @@ import numpy as np
 
 from tgslam.cli import engine
 from tgslam.errors import OutputError
-from tgslam.evaluation.planes import ReadIds
+from tgslam.evaluation.plane_metrics import ReadIds
 from tgslam.evaluation.protocol import Render
 from tgslam.geometry import inverse, se3_exp, transform_points
-from tgslam.output.images import write_colour, write_depth, write_depth_colours
+from tgslam.output.pictures import write_colour, write_depth, write_depth_colours
 from tgslam.output.plane_overlay import plane_overlay
 from tgslam.output.planes_io import read_planes
 from tgslam.output.ply import read_map

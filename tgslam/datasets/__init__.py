@@ -24,7 +24,7 @@ def open_source(config: DatasetConfig, synthetic: SyntheticConfig, seed: int, in
             raise ConfigError(
                 f"--input {input_dir} does not go with dataset.format=synthetic; set dataset.format to tum or icl"
             )
-        from tgslam.datasets.synthetic import SyntheticSource  # brings in the renderer, which folders do without
+        from tgslam.datasets.built_in import SyntheticSource  # brings in the renderer, which folders do without
 
         return SyntheticSource(synthetic, seed)
     openers = {"tum": open_tum, "icl": open_icl}

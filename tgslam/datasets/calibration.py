@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam.camera import Camera
 from tgslam.config.schema import DatasetConfig
 from tgslam.errors import ConfigError
-from tgslam.types import Camera
 
 _log = logging.getLogger(__name__)
 _DISTORTION_LENGTHS = (4, 5, 8, 12, 14)  # OpenCV's models

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from tgslam.camera import Camera
 from tgslam.config.schema import DatasetConfig
-from tgslam.datasets import images
+from tgslam.datasets import image_files as images
 from tgslam.datasets.calibration import Calibration, check_size
 from tgslam.datasets.groundtruth import read_groundtruth
 from tgslam.datasets.lists import ImagePair
 from tgslam.datasets.truth import SceneTruth
 from tgslam.errors import DatasetError, FrameError
-from tgslam.types import Camera, Frame, Trajectory
+from tgslam.types import Frame, Trajectory
 
 
 class FolderSource:

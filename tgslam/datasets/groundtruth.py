@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tgslam.datasets.tum_text import read_pose_rows, trajectory_from_rows, usable_pose_rows
 from tgslam.errors import DatasetError
+from tgslam.files.tum_text import read_pose_rows, trajectory_from_rows, usable_pose_rows
 from tgslam.types import Trajectory
 
 _log = logging.getLogger(__name__)

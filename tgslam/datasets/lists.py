@@ -8,9 +8,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
-from tgslam.datasets.association import associate_times
-from tgslam.datasets.tum_text import read_rows
+from tgslam.datasets.time_matching import associate_times
 from tgslam.errors import DatasetError
+from tgslam.files.tum_text import read_rows
 
 _log = logging.getLogger(__name__)
 

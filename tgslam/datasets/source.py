@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from tgslam.camera import Camera
 from tgslam.datasets.truth import SceneTruth, TruthOfFrames
 from tgslam.errors import ConfigError, DatasetError
-from tgslam.types import Camera, Frame, Trajectory
+from tgslam.types import Frame, Trajectory
 
 
 class RgbdSource(Protocol):

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from tgslam.config.schema import EvaluationConfig
 from tgslam.datasets.source import RgbdSource
 from tgslam.errors import EvaluationError, FrameError
-from tgslam.evaluation.images import ImageScores, mean_scores, score_rendering
+from tgslam.evaluation.image_metrics import ImageScores, mean_scores, score_rendering
 from tgslam.evaluation.trajectory import ate, rpe
 from tgslam.geometry import inverse
 from tgslam.types import FrameReport, FrameStatus, Gaussians, Matrix4, Rendering, Trajectory

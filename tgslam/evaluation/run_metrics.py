@@ -11,7 +11,7 @@ from typing import Any
 from tgslam.config.schema import EvaluationConfig
 from tgslam.datasets.source import RgbdSource
 from tgslam.errors import EvaluationError, OutputError
-from tgslam.evaluation.planes import (
+from tgslam.evaluation.plane_metrics import (
     FLOATER_KEY,
     INSTANCE_KEYS,
     SUMMARY_KEYS,
@@ -28,7 +28,7 @@ from tgslam.evaluation.protocol import (
     image_metrics,
     trajectory_metrics,
 )
-from tgslam.evaluation.surfaces import SURFACE_KEY, surface_metrics
+from tgslam.evaluation.surface_switches import SURFACE_KEY, surface_metrics
 from tgslam.evaluation.trajectory import align_poses
 from tgslam.output.log import read_log
 from tgslam.output.planes_io import read_planes

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tgslam.datasets.association import associate_times
+from tgslam.datasets.time_matching import associate_times
 from tgslam.errors import EvaluationError
 from tgslam.geometry import inverse, transform_points
 from tgslam.types import Matrix4, Trajectory

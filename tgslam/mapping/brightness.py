@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam.camera import Camera
 from tgslam.geometry import inverse, transform_points
-from tgslam.mapping.keyframe import Keyframe
-from tgslam.types import Camera
+from tgslam.map.keyframe import Keyframe
 
 _STEP_PX = 4  # every n-th pixel and row
 _SAME_SURFACE = 0.03  # relative difference of depth

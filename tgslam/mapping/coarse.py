@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.gaussian_map import GaussianMap
 from tgslam.geometry import matrix_from_quat_wxyz
+from tgslam.map.gaussians import GaussianMap
 from tgslam.mapping.surface import Surface
 from tgslam.types import Gaussians
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tgslam.config.schema import PlanesConfig
 from tgslam.geometry import inverse
-from tgslam.planes.instance import NO_ID, PlanarInstance
+from tgslam.planes.instances.instance import NO_ID, PlanarInstance
 
 Points = NDArray[np.float64]
 

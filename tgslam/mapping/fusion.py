@@ -9,8 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam import images, runtime
+from tgslam.device import runtime
 from tgslam.geometry import matrix_from_quat_wxyz, quat_product_wxyz
+from tgslam.ops import image as images
 
 _MAX_OBSERVATIONS = (
     30.0  # information grows to so many of the present view and no further: a map must be able to follow

@@ -10,20 +10,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam import images, runtime
+from tgslam.camera import Camera
 from tgslam.config.schema import LossConfig, MappingConfig, PlanesConfig, SeedingConfig, StructureConfig
-from tgslam.depth import filled
-from tgslam.gaussian_map import GaussianMap
+from tgslam.device import runtime
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, orthonormalized, transform_points
+from tgslam.map.gaussians import GaussianMap
+from tgslam.map.keyframe import Keyframe
 from tgslam.mapping.carriers import Carriers
 from tgslam.mapping.coarse import halved, seen_in_part, seen_whole
 from tgslam.mapping.fusion import block_centre, depth_pyramid, fused_depth, sample, turned
-from tgslam.mapping.keyframe import Keyframe
+from tgslam.mapping.insertion import cell_levels, cell_sizes, quadtree, seed
 from tgslam.mapping.refinement import Refiner
-from tgslam.mapping.seeding import cell_levels, cell_sizes, quadtree, seed
 from tgslam.mapping.surface import Surface
 from tgslam.mapping.viewpoints import Viewpoints
-from tgslam.types import Camera, Gaussians, Matrix4
+from tgslam.ops import image as images
+from tgslam.ops.depth import filled
+from tgslam.types import Gaussians, Matrix4
 
 if TYPE_CHECKING:
     from tgslam.mapping.planar import PlanarMapping, PlanarPixels

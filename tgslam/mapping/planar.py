@@ -9,19 +9,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam import runtime
+from tgslam.camera import Camera
 from tgslam.config.schema import PlanesConfig
-from tgslam.gaussian_map import GaussianMap
+from tgslam.device import runtime
 from tgslam.geometry import inverse
+from tgslam.map.gaussians import GaussianMap
+from tgslam.map.keyframe import Keyframe
 from tgslam.mapping.extents import KnownExtents
-from tgslam.mapping.keyframe import Keyframe
 from tgslam.mapping.surface import Projection
-from tgslam.planes.extraction import extract_planes
-from tgslam.planes.instance import NO_ID, PlanarInstance
-from tgslam.planes.registry import PlaneRegistry
-from tgslam.planes.table import PlaneTable
+from tgslam.planes.instances.instance import NO_ID, PlanarInstance
+from tgslam.planes.instances.plane_table import PlaneTable
+from tgslam.planes.instances.registry import PlaneRegistry
+from tgslam.planes.segmentation.extraction import extract_planes
 from tgslam.tracking.reference import NO_PLANES
-from tgslam.types import Camera
 
 _MAX_SLANT = 0.1  # of its depth by which a plane's changes at most where it continues into a hole
 _CLOSING_PX = 7  # window in which a PGI may surround a pixel

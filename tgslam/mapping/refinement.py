@@ -7,21 +7,23 @@ from collections import OrderedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam import losses, runtime
+from tgslam.camera import Camera
 from tgslam.config.schema import LossConfig, MappingConfig, StructureConfig
-from tgslam.gaussian_map import GaussianMap, MapGradient
+from tgslam.device import runtime
+from tgslam.device.stopwatch import Stopwatch, stage
 from tgslam.geometry import orthonormalized, se3_exp
-from tgslam.instance_field import InstanceGradient
-from tgslam.kernels import relaxation
-from tgslam.mapping.keyframe import Keyframe
+from tgslam.map.gaussians import GaussianMap
+from tgslam.map.keyframe import Keyframe
 from tgslam.mapping.sightings import Sightings
-from tgslam.mapping.structure import StructureTerms
-from tgslam.optim import Adam
-from tgslam.planes.table import PlaneTable
-from tgslam.render import ImageGradient, Rasterizer
-from tgslam.stopwatch import Stopwatch, stage
-from tgslam.types import Camera
-from tgslam.vector_adam import VectorAdam
+from tgslam.mapping.structure_terms import StructureTerms
+from tgslam.ops import loss as losses
+from tgslam.ops import relaxation
+from tgslam.ops.adam import Adam
+from tgslam.ops.instance_field import InstanceGradient
+from tgslam.ops.rasterize import ImageGradient, Rasterizer
+from tgslam.ops.splats import MapGradient
+from tgslam.ops.vector_adam import VectorAdam
+from tgslam.planes.instances.plane_table import PlaneTable
 
 _GEOMETRY = {"mean": 3, "log_scale": 3, "quat_wxyz": 4, "opacity_logit": 0}
 

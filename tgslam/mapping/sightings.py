@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam import runtime
-from tgslam.gaussian_map import grown
-from tgslam.kernels import rows as kernels
+from tgslam.device import runtime
+from tgslam.map.gaussians import grown
+from tgslam.ops import rows
 
 _MIN_CAPACITY = 64
 
@@ -49,8 +49,8 @@ class Sightings:
         self.rows = len(kept)
 
     def record(self, visible: np.ndarray, curvature: np.ndarray, totals: np.ndarray, weight: float) -> None:
-        """Count a view; arguments as in `kernels.rows.record_view`."""
-        kernels.record_view(self.rows, visible, curvature, totals, weight, self._contribution, self._views)
+        """Count a view; arguments as in `ops.rows.record_view`."""
+        rows.record_view(self.rows, visible, curvature, totals, weight, self._contribution, self._views)
 
     def _resize(self, kept: NDArray[np.integer], capacity: int) -> None:
         self._contribution = grown(self.contribution[kept], len(kept), capacity)

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.gaussian_map import GaussianMap
+from tgslam.camera import Camera
 from tgslam.geometry import matrix_from_quat_wxyz, transform_points
-from tgslam.kernels.projection import EDGE
-from tgslam.mapping.keyframe import Keyframe
-from tgslam.types import Camera
+from tgslam.map.gaussians import GaussianMap
+from tgslam.map.keyframe import Keyframe
+from tgslam.ops.splats import IMAGE_EDGE
 
 _NEAR_M = 0.05
 _HIDDEN = 1.25  # times the depth at a pixel: what lies farther is behind another surface
@@ -61,7 +61,7 @@ class Projection:
 
 def _in_view(pixel: NDArray[np.float64], centre: float, focal: float, size: int) -> NDArray[np.float64]:
     """x/z (or y/z), limited as when splats are projected (`kernels.projection.in_view`)."""
-    beyond = 0.5 * (EDGE - 1.0) * size
+    beyond = 0.5 * (IMAGE_EDGE - 1.0) * size
     ratio: NDArray[np.float64] = (np.clip(pixel, -beyond, size + beyond) - centre) / focal
     return ratio
 

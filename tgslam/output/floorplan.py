@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.output.atomic import write_text
+from tgslam.files.atomic import write_text
 from tgslam.types import Plane
 
 Vector = NDArray[np.float64]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.errors import OutputError
-from tgslam.output.atomic import write_text
+from tgslam.files.atomic import write_text
 from tgslam.types import Plane
 
 _UNIT_TOLERANCE = 1e-6  # of a normal's length

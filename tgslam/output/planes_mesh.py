@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from tgslam.output.atomic import atomic_file
+from tgslam.files.atomic import atomic_file
+from tgslam.geometry import tangent_axes
 from tgslam.output.triangulation import triangulate
-from tgslam.planes.segment import tangents
 from tgslam.types import Plane
 
 
@@ -32,7 +32,7 @@ def write_mesh(path: Path, planes: Sequence[Plane]) -> None:
 
 
 def _mesh(plane: Plane, name: str) -> trimesh.Trimesh:
-    axes = tangents(plane.normal_w)
+    axes = tangent_axes(plane.normal_w)
     first = np.cumsum([0, *(len(polygon) for polygon in plane.polygons_w)])
     triangles = [triangulate(polygon @ axes.T) for polygon in plane.polygons_w]
     faces = np.concatenate([part + start for part, start in zip(triangles, first, strict=False)])

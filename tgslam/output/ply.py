@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.errors import OutputError
-from tgslam.output.atomic import atomic_file
+from tgslam.files.atomic import atomic_file
 from tgslam.types import Gaussians
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))

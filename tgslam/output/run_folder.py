@@ -11,16 +11,17 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
+from tgslam.camera import Camera
 from tgslam.config.loader import dump, load
 from tgslam.config.schema import Config
 from tgslam.errors import OutputError
-from tgslam.output.atomic import write_text
+from tgslam.files.atomic import write_text
 from tgslam.output.floorplan import write_floorplan
 from tgslam.output.log import plain
 from tgslam.output.plane_colours import in_plane_colours
 from tgslam.output.planes_io import write_planes
 from tgslam.output.ply import write_vertices
-from tgslam.types import Camera, Gaussians, Plane
+from tgslam.types import Gaussians, Plane
 
 
 class RunState(Enum):

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from tgslam.datasets.tum_text import read_pose_rows, trajectory_from_rows, usable_pose_rows
 from tgslam.errors import OutputError
+from tgslam.files.atomic import write_text
+from tgslam.files.tum_text import read_pose_rows, trajectory_from_rows, usable_pose_rows
 from tgslam.geometry import quat_wxyz_from_matrix
-from tgslam.output.atomic import write_text
 from tgslam.types import Trajectory
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam.geometry import tangent_axes
 from tgslam.planes.segment import PlaneSegment
 
 Vector = NDArray[np.float64]
@@ -84,14 +85,6 @@ class PlaneEstimate:
 
     def _with_covariance(self, covariance: Vector) -> PlaneEstimate:
         return PlaneEstimate(self.normal, self.offset_m, self.centroid, self.axes, covariance)
-
-
-def tangent_axes(normal: Vector) -> Vector:
-    """[..., 2, 3] for normals [..., 3]: `segment.tangents` of each."""
-    helper = np.eye(3)[np.argmin(np.abs(normal), axis=-1)]
-    first = np.cross(helper, normal)
-    first /= np.linalg.norm(first, axis=-1, keepdims=True)
-    return np.stack([first, np.cross(normal, first)], axis=-2)
 
 
 def from_segments(segments: Sequence[PlaneSegment]) -> PlaneEstimate:

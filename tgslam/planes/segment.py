@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.geometry import hat
-
 Vector = NDArray[np.float64]
 
 
@@ -34,11 +32,3 @@ class PlaneView:
     labels: NDArray[np.int32]  # [H, W] index into segments, -1 = on no plane
     segments: tuple[PlaneSegment, ...]  # largest first
     steps: frozenset[tuple[int, int]] = frozenset()  # adjoining segments that are level but for a step between them
-
-
-def tangents(normal: Vector) -> Vector:
-    """[2, 3] unit vectors, right-handed with the normal [3]: the axes that a segment's covariance speaks of."""
-    cross = hat(normal)  # row k is e_k x normal
-    first = cross[np.argmin(np.abs(normal))]
-    first = first / np.linalg.norm(first)
-    return np.stack([first, cross @ first])

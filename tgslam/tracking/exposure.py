@@ -4,17 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-
-@dataclass(frozen=True)
-class Exposure:
-    """map intensity = gain * frame intensity + bias."""
-
-    gain: float = 1.0
-    bias: float = 0.0
-
-    def relative_to(self, other: Exposure) -> Exposure:
-        """That of the same frame against another frame's image, whose exposure is `other`."""
-        return Exposure(self.gain / other.gain, (self.bias - other.bias) / other.gain)
+from tgslam.types import Exposure
 
 
 @dataclass(frozen=True)

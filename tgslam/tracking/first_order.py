@@ -7,19 +7,22 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam import images, losses, runtime
+from tgslam.camera import Camera
 from tgslam.config.schema import LossConfig, TrackingConfig
-from tgslam.gaussian_map import GaussianMap, MapGradient
+from tgslam.device import runtime
+from tgslam.device.stopwatch import Stopwatch, stage
 from tgslam.geometry import se3_exp
-from tgslam.render import ImageGradient, Rasterizer
-from tgslam.stopwatch import Stopwatch, stage
-from tgslam.tracking.exposure import Exposure
+from tgslam.map.gaussians import GaussianMap
+from tgslam.ops import image as images
+from tgslam.ops import loss as losses
+from tgslam.ops.rasterize import ImageGradient, Rasterizer
+from tgslam.ops.splats import MapGradient
+from tgslam.ops.vector_adam import VectorAdam
 from tgslam.tracking.gauss_newton import GaussNewtonTracker
 from tgslam.tracking.pyramid import finest_level
 from tgslam.tracking.reference import Reference
 from tgslam.tracking.result import TrackingResult
-from tgslam.types import Camera, Frame
-from tgslam.vector_adam import VectorAdam
+from tgslam.types import Exposure, Frame
 
 
 class FirstOrderTracker:

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam.camera import Camera
 from tgslam.config.schema import LossConfig, TrackingConfig
-from tgslam.gaussian_map import GaussianMap
+from tgslam.device.stopwatch import Stopwatch, stage
 from tgslam.geometry import adjoint, inverse, se3_exp, se3_log
-from tgslam.render import Rasterizer
-from tgslam.stopwatch import Stopwatch, stage
-from tgslam.tracking.exposure import Exposure, fit_exposure
+from tgslam.map.gaussians import GaussianMap
+from tgslam.ops.rasterize import Rasterizer
+from tgslam.tracking.exposure import fit_exposure
 from tgslam.tracking.linearisation import Lineariser, NormalEquations
 from tgslam.tracking.lost import LostDetector
 from tgslam.tracking.pyramid import (
@@ -26,7 +27,7 @@ from tgslam.tracking.pyramid import (
 )
 from tgslam.tracking.reference import NO_PLANES, Reference
 from tgslam.tracking.result import TrackingResult
-from tgslam.types import Camera, Frame
+from tgslam.types import Exposure, Frame
 
 _CONVERGED = 1e-5  # rad and m: a smaller step ends a level
 _DAMPING = 1e-6  # of the normal matrix's trace

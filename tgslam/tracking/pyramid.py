@@ -11,13 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam import images, runtime
+from tgslam.camera import Camera
 from tgslam.config.schema import LossConfig
-from tgslam.kernels import alignment
-from tgslam.kernels import image as kernels
-from tgslam.render import RenderImages
+from tgslam.device import runtime
+from tgslam.ops import alignment
+from tgslam.ops import image as images
+from tgslam.ops.rasterize import RenderImages
 from tgslam.tracking.reference import NO_PLANES, Reference
-from tgslam.types import Camera, Frame
+from tgslam.types import Frame
 
 # blocks of 2x2 px on each side: a rendered surface has little noise, and wide fits of a measured one round its edges
 _NORMAL_RADIUS = 1
@@ -28,7 +29,7 @@ class LiveLevel:
     """One resolution of the live frame."""
 
     camera: Camera
-    pixels: np.ndarray  # device array [H, B, LIVE, 16], see `kernels.alignment`; B = ceil(W / 16)
+    pixels: np.ndarray  # device array [H, B, LIVE, 16], see `ops.alignment`; B = ceil(W / 16)
     gate_low: float = 0.0  # G_min of Eq. 11, 1/px
     gate_inverse_range: float = 0.0  # 1 / (G_max - G_min + epsilon)
 
@@ -64,7 +65,7 @@ class LivePyramid:
         base = self._images.base
         images.reduce_frame(runtime.to_device(frame.colour), runtime.to_device(frame.depth_m), base.grey, base.depth)
         for level, pair, sample in zip(self.levels, self._images.halvings(), self._samples, strict=True):
-            kernels.pack_live(pair.grey, pair.depth, level.pixels)
+            alignment.pack_live(pair.grey, pair.depth, level.pixels)
             level.gate_low, level.gate_inverse_range = self._gate_range(level, sample)
         return self.levels
 
@@ -72,7 +73,7 @@ class LivePyramid:
         """G_min and 1 / (G_max - G_min + epsilon) of Eq. 11, from a grid of pixels. sample: memory for it."""
         if not self.loss.gate:
             return images.UNGATED
-        kernels.sample_strength(level.pixels, images.sample_step((level.camera.height, level.camera.width)), sample)
+        alignment.sample_strength(level.pixels, images.sample_step((level.camera.height, level.camera.width)), sample)
         return images.gate_range(runtime.to_host(sample), self.loss.gate_percentile, self.loss.gate_noise_floor)
 
 
@@ -162,8 +163,7 @@ class _ImagePyramid:
 
 
 def _live_level(camera: Camera) -> LiveLevel:
-    blocks = -(-camera.width // alignment.LANES)
-    return LiveLevel(camera, runtime.empty((camera.height, blocks, alignment.LIVE, alignment.LANES)))
+    return LiveLevel(camera, alignment.empty_live(camera))
 
 
 def _model_level(camera: Camera, *, measured: bool = False) -> ModelLevel:
@@ -173,8 +173,7 @@ def _model_level(camera: Camera, *, measured: bool = False) -> ModelLevel:
 
 
 def _write_model(level: ModelLevel, pair: _Pair, fits: images.PlaneFits, planes_c: NDArray[np.float64]) -> None:
-    kernels.pack_texture(pair.grey, level.texture)
-    kernels.pack_second_derivatives(level.texture)
+    alignment.pack_texture(pair.grey, level.texture)
     fits.write(pair.depth, level.surface)
     fits.adopt(planes_c, level.surface, measured=level.measured)
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.geometry import inverse
-from tgslam.tracking.exposure import Exposure
+from tgslam.types import Exposure
 
 NO_PLANES: NDArray[np.float64] = np.zeros((0, 4))
 

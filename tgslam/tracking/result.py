@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.tracking.exposure import Exposure
+from tgslam.types import Exposure
 
 
 @dataclass(frozen=True)

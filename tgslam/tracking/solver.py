@@ -9,16 +9,16 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam.camera import Camera
 from tgslam.config.schema import LossConfig, TrackingConfig
-from tgslam.gaussian_map import GaussianMap
-from tgslam.render import Rasterizer
-from tgslam.stopwatch import Stopwatch
-from tgslam.tracking.exposure import Exposure
+from tgslam.device.stopwatch import Stopwatch
+from tgslam.map.gaussians import GaussianMap
+from tgslam.ops.rasterize import Rasterizer
 from tgslam.tracking.first_order import FirstOrderTracker
 from tgslam.tracking.gauss_newton import GaussNewtonTracker
 from tgslam.tracking.reference import Reference
 from tgslam.tracking.result import TrackingResult
-from tgslam.types import Camera, Frame
+from tgslam.types import Exposure, Frame
 
 
 class Tracker(Protocol):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tools.cudacheck import budgets, ptxas
 from tools.cudacheck.environment import CACHE_VARIABLE, Grid, require_platform
-from tools.cudacheck.errors import CudaCheckError
+from tools.cudacheck.failures import CudaCheckError
 from tools.cudacheck.program import Outcome, run_program
 
 _DESCRIPTION = "Check the CUDA kernels of a Taichi program on a machine that has no GPU."

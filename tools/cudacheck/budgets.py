@@ -8,7 +8,7 @@ from pathlib import Path
 
 import yaml
 
-from tools.cudacheck.errors import CudaCheckError
+from tools.cudacheck.failures import CudaCheckError
 from tools.cudacheck.ptxas import Usage
 
 BUDGETS_FILE = Path(__file__).parent / "budgets.yaml"

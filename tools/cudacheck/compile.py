@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tools.cudacheck.errors import CudaCheckError
+from tools.cudacheck.failures import CudaCheckError
 from tools.cudacheck.translator import translate
 
 NATIVE = Path(__file__).parent / "native"

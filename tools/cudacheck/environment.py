@@ -14,7 +14,7 @@ from enum import Enum
 from pathlib import Path
 
 from tools.cudacheck.compile import FLAGS, NATIVE
-from tools.cudacheck.errors import CudaCheckError, MissingToolError
+from tools.cudacheck.failures import CudaCheckError, MissingToolError
 
 REPORT_PREFIX = "cudastub:"
 CACHE_VARIABLE = "CUDACHECK_CACHE"

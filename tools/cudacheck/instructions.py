@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-from tools.cudacheck.errors import UnsupportedPtxError
+from tools.cudacheck.failures import UnsupportedPtxError
 from tools.cudacheck.ptx import Instruction, bits, split_operands
 
 _COMPARISONS = {

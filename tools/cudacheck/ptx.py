@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from tools.cudacheck.errors import UnsupportedPtxError
+from tools.cudacheck.failures import UnsupportedPtxError
 
 _DIRECTIVE_LINE = re.compile(r"^[ \t]*\.(version|target|address_size|loc|file|section)\b.*$", re.MULTILINE)
 _COMMENT = re.compile(r"//[^\n]*")

@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 
 from tools.cudacheck.environment import require_program
-from tools.cudacheck.errors import CudaCheckError
+from tools.cudacheck.failures import CudaCheckError
 
 ARCHITECTURES = ("sm_86", "sm_89", "sm_90")
 _TASK = re.compile(r"(?P<kernel>.+)_c\d+_\d+(?:_(?:reverse|forward)_grad)?_kernel_\d+_\w+")

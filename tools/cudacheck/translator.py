@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 
 from tools.cudacheck import instructions
-from tools.cudacheck.errors import UnsupportedPtxError
+from tools.cudacheck.failures import UnsupportedPtxError
 from tools.cudacheck.ptx import (
     Brace,
     Call,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from tests.cuda.harness import scenario
-from tgslam import runtime
-from tgslam.optim import Adam
+from tgslam.device import runtime
+from tgslam.ops.adam import Adam
 
 
 @scenario

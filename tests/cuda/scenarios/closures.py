@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from tests.cuda.harness import scenario
-from tgslam import closure_fit, runtime
+from tgslam.camera import Camera
+from tgslam.device import runtime
 from tgslam.geometry import se3_exp
-from tgslam.types import Camera
+from tgslam.ops import closure_icp as closure_fit
 
 _SIGMA_PER_M2, _MODEL_M = 0.0015, 0.003
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from tests.cuda.harness import scenario
-from tgslam import depth, images, runtime
-from tgslam.types import Camera
+from tgslam.camera import Camera
+from tgslam.device import runtime
+from tgslam.ops import depth
+from tgslam.ops import image as images
 
 _SIGMA_PER_M2 = 0.0015
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from tests.cuda.harness import scenario
 from tests.test_loss_kernels import BIAS, CONFIG, GAIN, scene
-from tgslam import losses, runtime
+from tgslam.device import runtime
+from tgslam.ops import loss as losses
 
 MIN_OPACITY = 0.4
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from tests.cuda.harness import scenario
-from tgslam import runtime
+from tgslam.camera import Camera
 from tgslam.config.schema import PlanesConfig
-from tgslam.planes.extraction import extract_planes
-from tgslam.types import Camera
+from tgslam.device import runtime
+from tgslam.planes.segmentation.extraction import extract_planes
 
 _SIGMA_PER_M2 = 0.0015
 

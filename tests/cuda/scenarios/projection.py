@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tests.cuda.harness import scenario
-from tgslam import runtime
+from tgslam.device import runtime
 from tgslam.geometry import se3_exp
 from tgslam.kernels import projection, projection_gradient
 

@@ -18,11 +18,13 @@ from tests.test_render import (
     opaque_stack,
     random_gaussians,
 )
-from tgslam import runtime
-from tgslam.gaussian_map import GaussianMap, MapGradient
-from tgslam.render import ImageGradient, Rasterizer
-from tgslam.splatting.cpu import CpuSplatting
-from tgslam.types import Camera, Gaussians
+from tgslam.camera import Camera
+from tgslam.device import runtime
+from tgslam.map.gaussians import GaussianMap
+from tgslam.ops.rasterize import ImageGradient, Rasterizer
+from tgslam.ops.rasterize_cpu import CpuSplatting
+from tgslam.ops.splats import MapGradient
+from tgslam.types import Gaussians
 
 IMAGES = ("colour", "depth", "opacity", "embedding")
 WALL = (24, 20)  # layers of `wall`, sheets behind it

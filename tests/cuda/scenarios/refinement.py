@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from tests.cuda.harness import scenario
+from tgslam.camera import Camera
 from tgslam.config.schema import LossConfig, MappingConfig, StructureConfig, SyntheticConfig
-from tgslam.datasets.synthetic import SyntheticSource
-from tgslam.gaussian_map import PARAMETERS, GaussianMap
+from tgslam.datasets.built_in import SyntheticSource
 from tgslam.geometry import se3_exp
-from tgslam.mapping.keyframe import Keyframe
+from tgslam.map.gaussians import PARAMETERS, GaussianMap
+from tgslam.map.keyframe import Keyframe
 from tgslam.mapping.refinement import Refiner
-from tgslam.mapping.structure import StructureTerms
-from tgslam.planes.table import PlaneTable
-from tgslam.tracking.exposure import Exposure
-from tgslam.types import Camera, Frame, Gaussians
+from tgslam.mapping.structure_terms import StructureTerms
+from tgslam.planes.instances.plane_table import PlaneTable
+from tgslam.types import Exposure, Frame, Gaussians
 
 _GRID = (40, 30)  # Gaussians in a row, rows
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tests.cuda.harness import scenario
-from tgslam import runtime
+from tgslam.device import runtime
 from tgslam.kernels import relaxation
 from tgslam.kernels.objective import TOTALS
 

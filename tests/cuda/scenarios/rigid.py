@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from tests.cuda.harness import scenario
-from tgslam.gaussian_map import GaussianMap
 from tgslam.geometry import se3_exp
+from tgslam.map.gaussians import GaussianMap
 from tgslam.types import Gaussians
 
 

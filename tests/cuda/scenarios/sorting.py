@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from tests.cuda.harness import scenario
-from tgslam import runtime
-from tgslam.splatting.sorting import Pairs, PrefixSums, RadixSort
+from tgslam.device import runtime
+from tgslam.ops.sort import Pairs, PrefixSums, RadixSort
 
 
 def keys_with_ties(count: int, distinct: int, seed: int = 0) -> np.ndarray:

@@ -10,8 +10,9 @@ from tests.test_instance_field import evaluate as evaluate_field
 from tests.test_instance_field import scene as field_scene
 from tests.test_plane_regularisers import evaluate as evaluate_planes
 from tests.test_plane_regularisers import scene as plane_scene
-from tgslam import instance_field, runtime
-from tgslam.planes.codes import read_ids
+from tgslam.device import runtime
+from tgslam.ops import instance_field
+from tgslam.planes.identity.codes import read_ids
 
 
 @scenario

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from tests.cuda.harness import scenario
+from tgslam.camera import Camera
 from tgslam.config.schema import Config
 from tgslam.geometry import inverse, se3_exp
 from tgslam.slam import Slam
-from tgslam.types import Camera, Frame
+from tgslam.types import Frame
 
 _CORNER = (np.array([[0.1, 0.05, -1.0], [-1.0, 0.1, 0.0], [0.05, -1.0, -0.1]]), np.array([3.0, 1.2, 0.8]))
 _MOTION = [0.004, -0.008, 0.003, 0.01, 0.005, -0.008]

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from tests.cuda.harness import scenario
-from tgslam import runtime
+from tgslam.camera import Camera
 from tgslam.config.schema import LossConfig, TrackingConfig
+from tgslam.device import runtime
 from tgslam.geometry import se3_exp
 from tgslam.kernels import alignment
-from tgslam.render import RenderImages
-from tgslam.tracking.exposure import Exposure
+from tgslam.ops.rasterize import RenderImages
 from tgslam.tracking.linearisation import Lineariser
 from tgslam.tracking.pyramid import LivePyramid, ModelPyramid
-from tgslam.types import Camera, Frame
+from tgslam.types import Exposure, Frame
 
 _LOSS = LossConfig()
 _MIN_OPACITY = 0.5

@@ -14,11 +14,11 @@ from types import TracebackType
 from typing import Any
 
 from tgslam.bench.ablation.jobs import Job
-from tgslam.bench.run import child_environment
+from tgslam.bench.whole_run import child_environment
 from tgslam.config.loader import dump
+from tgslam.device.runtime import available_threads
 from tgslam.errors import ClusterError
-from tgslam.output.atomic import write_text
-from tgslam.runtime import available_threads
+from tgslam.files.atomic import write_text
 
 Ended = Callable[[Job, str | None], None]  # told of each run as it ends: None, or why it failed
 

@@ -1,0 +1,102 @@
+"""Visual loop closure: a keyframe is recognised among all earlier ones by how it looks, and verified by geometry.
+
+Unlike structure closures these are meant to correct drift that the graph does not know of, so that the graph's own
+belief cannot be what decides. Evidence within the images does: many features on one motion, depth images that fit
+together, and a second earlier keyframe that on its own leads to the same place. The graph rules out only what no drift
+explains, such as the next of a corridor's equal doors in place of the one just passed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tgslam.camera import Camera
+from tgslam.config.schema import LoopConfig
+from tgslam.geometry import inverse, se3_log
+from tgslam.graph.gating import passes
+from tgslam.graph.structure.search import Closure, Findings, Relative
+from tgslam.graph.visual.depth_agreement import DepthGrid
+from tgslam.graph.visual.features import Detector
+from tgslam.graph.visual.retrieval import Retrieval
+from tgslam.graph.visual.verification import Look, Sameness, Verification
+from tgslam.types import FloatImage
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Verified:
+    """An earlier keyframe whose place the present one shows."""
+
+    order: int  # among the keyframes
+    keyframe: int
+    same: Sameness
+
+
+class LoopSearch:
+    """Compares each keyframe with the earlier ones that look most alike; it remembers all that it is given."""
+
+    def __init__(self, camera: Camera, depth_sigma_per_m2: float, config: LoopConfig) -> None:
+        """depth_sigma_per_m2: the sensor's noise, sigma_z = this * z^2."""
+        self._camera, self._config = camera, config
+        self._detector, self._retrieval = Detector(config), Retrieval()
+        self._verification = Verification(camera, depth_sigma_per_m2, config)
+        self._keyframes: list[int] = []  # in the order they came in
+        self._looks: list[Look] = []
+
+    def find(
+        self, keyframe: int, colour: FloatImage, depth_m: FloatImage, T_cw: Mapping[int, Vector], relative: Relative
+    ) -> Findings:
+        """At most one closure of the next keyframe, of colour [H, W, 3] in [0, 1] and depth [H, W] m, 0 = none.
+
+        T_cw: [4, 4] of each keyframe so far, and `relative` between two of them, as the graph has it
+        (`PoseGraph.relative`).
+        """
+        features = self._detector.detect(colour, depth_m)
+        look = Look(features, DepthGrid.of(depth_m, self._camera))
+        words = self._retrieval.words(features.descriptors)
+        best, unconfirmed = self._recognised(look, self._alike(self._retrieval.scores(words)), T_cw)
+        self._retrieval.add(words)
+        self._keyframes.append(keyframe)
+        self._looks.append(look)
+        if best is None:
+            return Findings((), unconfirmed, gated=0)
+        measured = self._verification.refined(best.same, self._looks[best.order], look)
+        T_ji, covariance = relative(best.keyframe, keyframe)
+        drift = self._config.understated**2 * covariance
+        if not passes(measured, T_ji, drift, self._config.gate_probability):
+            return Findings((), unconfirmed, gated=1)
+        return Findings((Closure(best.keyframe, (), measured),), unconfirmed, gated=0)
+
+    def _alike(self, scores: Vector) -> list[int]:
+        """The most alike of the earlier keyframes that are no neighbours, best first; of equal ones the oldest."""
+        old = scores[: max(len(scores) - self._config.min_gap, 0)]
+        best = np.argsort(-old, kind="stable")[: self._config.candidates]
+        return [int(order) for order in best if old[order] > 0.0]
+
+    def _recognised(self, look: Look, orders: list[int], T_cw: Mapping[int, Vector]) -> tuple[_Verified | None, int]:
+        """The better of the first two that confirm each other, and how many were verified and not confirmed."""
+        verified: list[_Verified] = []
+        for order in orders:
+            same = self._verification.compare(self._looks[order], look)
+            if same is None:
+                continue
+            found = _Verified(order, self._keyframes[order], same)
+            partner = next((other for other in verified if self._confirms(other, found, T_cw)), None)
+            if partner is not None:
+                return max(partner, found, key=lambda each: each.same.inliers), len(verified) - 1
+            verified.append(found)
+        return None, len(verified)
+
+    def _confirms(self, other: _Verified, one: _Verified, T_cw: Mapping[int, Vector]) -> bool:
+        """Whether two earlier keyframes, near to each other, see the present one at the same place."""
+        if abs(other.order - one.order) > self._config.partner_gap:
+            return False
+        between = T_cw[other.keyframe] @ inverse(T_cw[one.keyframe])
+        error = se3_log(other.same.measured.T_ji @ between @ inverse(one.same.measured.T_ji))
+        turn, shift = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
+        return bool(turn <= self._config.partner_rad and shift <= self._config.partner_m)

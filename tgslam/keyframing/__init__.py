@@ -1,0 +1,1 @@
+"""When a frame becomes a keyframe (section 3.1): co-visibility, baseline and the structure cue."""

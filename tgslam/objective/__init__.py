@@ -1,1 +1,0 @@
-"""The passes of the objective on each device, behind one interface."""

@@ -1,1 +1,0 @@
-"""The rasterizer's stages on each device, behind one interface."""
