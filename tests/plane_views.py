@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from tgslam.camera import Camera
-from tgslam.config.schema import PlanesConfig, SyntheticConfig
+from tgslam.config.input_settings import SyntheticConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.geometry import inverse, se3_exp, tangent_axes
 from tgslam.planes.instances.registry import Observation, PlaneRegistry

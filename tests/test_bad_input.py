@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from tgslam.cli import main
-from tgslam.config.schema import SyntheticConfig
+from tgslam.config.input_settings import SyntheticConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.output.trajectory_io import read_trajectory
 from tools.export_synthetic import export

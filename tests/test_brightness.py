@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tgslam.config.schema import SyntheticConfig
+from tgslam.config.input_settings import SyntheticConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.geometry import inverse
 from tgslam.map.keyframe import Keyframe

@@ -9,7 +9,9 @@ import pytest
 
 from tests.plane_worlds import Box, odometry, position_errors_m, walking
 from tgslam.camera import Camera
-from tgslam.config.schema import ClosureConfig, Config, LoopConfig, PlanesConfig
+from tgslam.config.graph_settings import ClosureConfig, LoopConfig
+from tgslam.config.plane_settings import PlanesConfig
+from tgslam.config.schema import Config
 from tgslam.errors import ConfigError
 from tgslam.geometry import inverse, orthonormalized, se3_exp, se3_log
 from tgslam.graph.closing import Correction, GraphClosing

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from tests.closure_views import CAMERA, SIGMA_PER_M2, WALK, fits, motion, view
 from tests.reference import closure_icp as reference
-from tgslam.config.schema import ClosureConfig
+from tgslam.config.graph_settings import ClosureConfig
 from tgslam.device import runtime
 from tgslam.geometry import inverse, se3_exp, se3_log, tangent_axes
 from tgslam.graph.relative import measure

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 from tests.closure_views import CAMERA, SIGMA_PER_M2, WALK, fits, motion, view
 from tests.plane_worlds import Box, looking, shifted
 from tests.test_plane_estimate import random_pose
-from tgslam.config.schema import ClosureConfig
+from tgslam.config.graph_settings import ClosureConfig
 from tgslam.geometry import inverse, se3_exp, se3_log, tangent_axes
 from tgslam.graph.gating import passes
 from tgslam.graph.relative import PlanePairs, measure, of_planes

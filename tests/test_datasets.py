@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tgslam.camera import Camera
-from tgslam.config.schema import DatasetConfig, SyntheticConfig
+from tgslam.config.input_settings import DatasetConfig, SyntheticConfig
 from tgslam.datasets import FrameRange, RgbdSource, open_source, parse_frame_slice
 from tgslam.datasets.calibration import Calibration, resolve
 from tgslam.datasets.image_files import Undistorter

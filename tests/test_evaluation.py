@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tgslam.config.schema import DatasetConfig, SyntheticConfig
+from tgslam.config.input_settings import DatasetConfig, SyntheticConfig
 from tgslam.datasets import open_source
 from tgslam.errors import EvaluationError
 from tgslam.evaluation import image_metrics as images

@@ -9,7 +9,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tgslam.config.schema import LossConfig, MappingConfig, SeedingConfig, SyntheticConfig
+from tgslam.config.input_settings import SyntheticConfig
+from tgslam.config.map_settings import LossConfig, MappingConfig, SeedingConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, so3_exp, transform_points
 from tgslam.map.keyframe import Keyframe

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tgslam.config.schema import KeyframeConfig
+from tgslam.config.tracking_settings import KeyframeConfig
 from tgslam.geometry import se3_exp
 from tgslam.keyframing.covisibility import KeyframeSelector
 from tgslam.types import Frame

@@ -11,7 +11,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tgslam.camera import Camera
-from tgslam.config.schema import ClosureConfig, Config, LoopConfig, SyntheticConfig
+from tgslam.config.graph_settings import ClosureConfig, LoopConfig
+from tgslam.config.input_settings import SyntheticConfig
+from tgslam.config.schema import Config
 from tgslam.datasets.built_in import SyntheticSource, synthetic_camera
 from tgslam.geometry import inverse, se3_exp, se3_log
 from tgslam.graph.pose_graph import PoseGraph

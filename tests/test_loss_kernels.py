@@ -7,7 +7,7 @@ import pytest
 
 from tests.reference import image as reference_image
 from tests.reference import loss as reference
-from tgslam.config.schema import LossConfig
+from tgslam.config.map_settings import LossConfig
 from tgslam.device import runtime
 from tgslam.ops import loss as losses
 

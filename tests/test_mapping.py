@@ -9,14 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tgslam.config.schema import (
-    LossConfig,
-    MappingConfig,
-    PlanesConfig,
-    SeedingConfig,
-    StructureConfig,
-    SyntheticConfig,
-)
+from tgslam.config.input_settings import SyntheticConfig
+from tgslam.config.map_settings import LossConfig, MappingConfig, SeedingConfig, StructureConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.device.stopwatch import Stopwatch
 from tgslam.evaluation.image_metrics import psnr

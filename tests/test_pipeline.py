@@ -12,7 +12,7 @@ import pytest
 
 from tests.fakes import FakeSource, FakeSystem, fake_render
 from tgslam import pipeline
-from tgslam.config.schema import EvaluationConfig
+from tgslam.config.input_settings import EvaluationConfig
 from tgslam.errors import EvaluationError, FrameError, OutputError, TrackingError
 from tgslam.evaluation.protocol import IMAGE_KEYS, held_out_poses, image_metrics, is_held_out
 from tgslam.evaluation.run_metrics import METRIC_KEYS, complete, evaluate_run

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from tests.plane_views import Rectangle, Stage, looking
 from tests.plane_worlds import shifted
 from tests.test_plane_estimate import random_plane, random_pose
-from tgslam.config.schema import PlanesConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.geometry import inverse, so3_exp, tangent_axes, transform_points
 from tgslam.keyframing.structure_cue import StructureCue
 from tgslam.planes.estimate import PlaneEstimate

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from tests.plane_views import DEPTH_SIGMA_PER_M2, Rectangle, Stage, cast, looking, points_c
-from tgslam.config.schema import PlanesConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.errors import EvaluationError
 from tgslam.evaluation.trajectory import align_poses
 from tgslam.geometry import inverse, se3_exp, transform_points

@@ -8,7 +8,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from tgslam.camera import Camera
-from tgslam.config.schema import PlanesConfig, SyntheticConfig
+from tgslam.config.input_settings import SyntheticConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.device import runtime
 from tgslam.geometry import tangent_axes

@@ -10,7 +10,7 @@ import pytest
 
 from tests.plane_views import DEPTH_SIGMA_PER_M2, Rectangle, cast, looking, points_c, segment_of
 from tgslam.camera import Camera
-from tgslam.config.schema import PlanesConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.device import runtime
 from tgslam.mapping.planar import PlanarMapping
 from tgslam.ops.plane_fit import CellGrid

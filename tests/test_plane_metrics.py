@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tests.fakes import CAMERA, FakeSource, FakeSystem, fake_read_ids, fake_render
 from tests.test_plane_outputs import FLOOR, ROOM, turned
 from tgslam import pipeline
-from tgslam.config.schema import EvaluationConfig
+from tgslam.config.input_settings import EvaluationConfig
 from tgslam.datasets.source import FrameRange
 from tgslam.evaluation.plane_metrics import (
     FLOATER_KEY,

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from tests.plane_views import Playback, Rectangle, Stage, looking
-from tgslam.config.schema import PlanesConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.geometry import inverse, se3_exp, tangent_axes
 from tgslam.planes.estimate import PlaneEstimate, deviation_sigmas
 from tgslam.planes.identity.palette import colours

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.plane_views import Rectangle, Stage, looking
-from tgslam.config.schema import PlanesConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.planes.estimate import PlaneEstimate
 from tgslam.planes.instances.instance import PlanarInstance
 from tgslam.planes.instances.unevenness import is_part

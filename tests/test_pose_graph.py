@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 
 from tests.plane_worlds import Box, odometry, position_errors_m, shifted, turning, walking
 from tests.test_plane_estimate import random_plane, random_pose
-from tgslam.config.schema import ClosureConfig
+from tgslam.config.graph_settings import ClosureConfig
 from tgslam.errors import GraphError
 from tgslam.geometry import inverse, se3_exp, se3_log
 from tgslam.graph.gating import passes

@@ -5,7 +5,7 @@ import pytest
 
 from tests.reference import image as reference
 from tgslam.camera import Camera
-from tgslam.config.schema import LossConfig
+from tgslam.config.map_settings import LossConfig
 from tgslam.device import runtime
 from tgslam.kernels import alignment
 from tgslam.ops import image as images

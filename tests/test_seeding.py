@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from tests.reference.seeding import cell_measures
 from tgslam.camera import Camera
-from tgslam.config.schema import SeedingConfig, SyntheticConfig
+from tgslam.config.input_settings import SyntheticConfig
+from tgslam.config.map_settings import SeedingConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.device import runtime
 from tgslam.evaluation.image_metrics import masked_psnr

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tgslam.config.input_settings import SyntheticConfig
 from tgslam.config.loader import load
-from tgslam.config.schema import Config, SyntheticConfig
+from tgslam.config.schema import Config
 from tgslam.datasets import FrameRange, RgbdSource, open_source
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.errors import FrameError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tgslam.camera import Camera
-from tgslam.config.schema import PlanesConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.geometry import inverse, se3_exp
 from tgslam.map.keyframe import Keyframe
 from tgslam.mapping.planar import PlanarMapping

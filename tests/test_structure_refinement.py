@@ -7,14 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tgslam.config.schema import (
-    LossConfig,
-    MappingConfig,
-    PlanesConfig,
-    SeedingConfig,
-    StructureConfig,
-    SyntheticConfig,
-)
+from tgslam.config.input_settings import SyntheticConfig
+from tgslam.config.map_settings import LossConfig, MappingConfig, SeedingConfig, StructureConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.device import runtime
 from tgslam.geometry import inverse

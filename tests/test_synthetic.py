@@ -11,8 +11,8 @@ import pytest
 
 from tests.reference import raycast as reference
 from tgslam.camera import Camera
+from tgslam.config.input_settings import DatasetConfig, SyntheticConfig
 from tgslam.config.loader import load
-from tgslam.config.schema import DatasetConfig, SyntheticConfig
 from tgslam.datasets import open_source
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.datasets.tum import open_tum

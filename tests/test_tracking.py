@@ -13,7 +13,10 @@ from scipy.special import ndtr
 
 from tests.reference import alignment as reference
 from tgslam.camera import Camera
-from tgslam.config.schema import Config, LossConfig, SyntheticConfig, TrackingConfig
+from tgslam.config.input_settings import SyntheticConfig
+from tgslam.config.map_settings import LossConfig
+from tgslam.config.schema import Config
+from tgslam.config.tracking_settings import TrackingConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.device import runtime
 from tgslam.geometry import inverse, se3_exp, se3_log

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 from tgslam.camera import Camera
+from tgslam.config.input_settings import SyntheticConfig
 from tgslam.config.loader import load
-from tgslam.config.schema import SyntheticConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.errors import OutputError, TgslamError
 from tgslam.files.atomic import write_text

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.bench.whole_run import child_environment
-from tgslam.config.schema import ClosureConfig
+from tgslam.config.graph_settings import ClosureConfig
 from tgslam.errors import EvaluationError
 from tgslam.evaluation.run_metrics import peak_rss_mb
 from tgslam.geometry import inverse, se3_exp, tangent_axes

@@ -8,7 +8,7 @@ import numpy as np
 
 from tgslam.bench.timing import Samples
 from tgslam.bench.workloads import Scene
-from tgslam.config.schema import LossConfig, MappingConfig
+from tgslam.config.map_settings import LossConfig, MappingConfig
 from tgslam.device.stopwatch import Stopwatch
 from tgslam.map.gaussians import GaussianMap
 from tgslam.map.keyframe import Keyframe

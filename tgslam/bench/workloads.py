@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.schema import SyntheticConfig
+from tgslam.config.input_settings import SyntheticConfig
 from tgslam.datasets.built_in import SyntheticSource, synthetic_camera
 from tgslam.datasets.image_files import colour_as_float, read_colour, read_raw_depth
 from tgslam.device import runtime

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tgslam.config.schema import DatasetConfig, SyntheticConfig
+from tgslam.config.input_settings import DatasetConfig, SyntheticConfig
 from tgslam.datasets.icl import open_icl
 from tgslam.datasets.source import FrameRange, RgbdSource, parse_frame_slice
 from tgslam.datasets.tum import open_tum

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.schema import SyntheticConfig
+from tgslam.config.input_settings import SyntheticConfig
 from tgslam.datasets.truth import SceneTruth
 from tgslam.synthetic import primitives as surfaces
 from tgslam.synthetic import sensor

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.schema import DatasetConfig
+from tgslam.config.input_settings import DatasetConfig
 from tgslam.errors import ConfigError
 
 _log = logging.getLogger(__name__)

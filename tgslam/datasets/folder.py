@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from tgslam.camera import Camera
-from tgslam.config.schema import DatasetConfig
+from tgslam.config.input_settings import DatasetConfig
 from tgslam.datasets import image_files as images
 from tgslam.datasets.calibration import Calibration, check_size
 from tgslam.datasets.groundtruth import read_groundtruth

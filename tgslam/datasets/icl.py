@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tgslam.config.schema import DatasetConfig
+from tgslam.config.input_settings import DatasetConfig
 from tgslam.datasets.calibration import Calibration, resolve
 from tgslam.datasets.folder import FolderSource
 from tgslam.datasets.lists import ASSOCIATION_FILES, find_association_file, pairs_from_associations

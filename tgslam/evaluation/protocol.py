@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 
-from tgslam.config.schema import EvaluationConfig
+from tgslam.config.input_settings import EvaluationConfig
 from tgslam.datasets.source import RgbdSource
 from tgslam.errors import EvaluationError, FrameError
 from tgslam.evaluation.image_metrics import ImageScores, mean_scores, score_rendering

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from tgslam.config.schema import EvaluationConfig
+from tgslam.config.input_settings import EvaluationConfig
 from tgslam.datasets.source import RgbdSource
 from tgslam.errors import EvaluationError, OutputError
 from tgslam.evaluation.plane_metrics import (

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.schema import ClosureConfig, LoopConfig
+from tgslam.config.graph_settings import ClosureConfig, LoopConfig
 from tgslam.geometry import inverse
 from tgslam.graph.pose_graph import PoseGraph
 from tgslam.graph.structure.icp import View

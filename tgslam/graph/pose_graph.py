@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.config.schema import ClosureConfig
+from tgslam.config.graph_settings import ClosureConfig
 from tgslam.errors import GraphError
 from tgslam.geometry import adjoint, hat, inverse
 from tgslam.planes.estimate import PlaneEstimate

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from tgslam.config.schema import ClosureConfig, LoopConfig
+from tgslam.config.graph_settings import ClosureConfig, LoopConfig
 from tgslam.geometry import so3_exp
 from tgslam.planes.estimate import PlaneEstimate, difference
 from tgslam.types import RelativePose

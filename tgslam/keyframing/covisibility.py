@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.config.schema import KeyframeConfig
+from tgslam.config.tracking_settings import KeyframeConfig
 from tgslam.device import runtime
 from tgslam.geometry import inverse
 from tgslam.ops import image as images

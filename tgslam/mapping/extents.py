@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.config.schema import PlanesConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.geometry import inverse
 from tgslam.planes.instances.instance import NO_ID, PlanarInstance
 

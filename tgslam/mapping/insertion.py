@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.schema import SeedingConfig
+from tgslam.config.map_settings import SeedingConfig
 from tgslam.device import runtime
 from tgslam.geometry import inverse, quat_wxyz_from_matrices, transform_points
 from tgslam.ops import seeding

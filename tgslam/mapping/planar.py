@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.schema import PlanesConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.device import runtime
 from tgslam.geometry import inverse
 from tgslam.map.gaussians import GaussianMap

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.schema import StructureConfig
+from tgslam.config.map_settings import StructureConfig
 from tgslam.device import runtime
 from tgslam.map.gaussians import GaussianMap
 from tgslam.map.keyframe import Keyframe

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from tgslam.config.schema import LossConfig
+from tgslam.config.map_settings import LossConfig
 from tgslam.device import runtime
 from tgslam.device.arrays import require
 from tgslam.kernels.objective import BIAS, DEPTHS, GAIN, GEO, GRAD, INNER, L1, PIXELS, SSIM

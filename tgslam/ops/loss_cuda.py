@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tgslam.config.schema import LossConfig
+from tgslam.config.map_settings import LossConfig
 from tgslam.device import runtime
 from tgslam.kernels.cuda import loss as kernels
 from tgslam.kernels.objective import MOMENTS, SLOPES, STRUCTURE, TOTALS

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.schema import LossConfig, TrackingConfig
+from tgslam.config.map_settings import LossConfig
+from tgslam.config.tracking_settings import TrackingConfig
 from tgslam.geometry import adjoint
 from tgslam.ops.alignment import NormalSums, layout
 from tgslam.tracking.exposure import IntensityMoments

@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 
-from tgslam.config.schema import TrackingConfig
+from tgslam.config.tracking_settings import TrackingConfig
 
 _HISTORY = 30  # tracked frames whose colour residual says what is usual here
 _MIN_HISTORY = 3

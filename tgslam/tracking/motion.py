@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.config.schema import TrackingConfig
+from tgslam.config.tracking_settings import TrackingConfig
 from tgslam.geometry import inverse, se3_exp, se3_log
 
 _LEAST_S = 1.0 / 120.0  # between frames whose timestamps say less

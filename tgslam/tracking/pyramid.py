@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.schema import LossConfig
+from tgslam.config.map_settings import LossConfig
 from tgslam.device import runtime
 from tgslam.ops import alignment
 from tgslam.ops import image as images

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.schema import LossConfig, TrackingConfig
+from tgslam.config.map_settings import LossConfig
+from tgslam.config.tracking_settings import TrackingConfig
 from tgslam.device.stopwatch import Stopwatch
 from tgslam.map.gaussians import GaussianMap
 from tgslam.ops.rasterize import Rasterizer

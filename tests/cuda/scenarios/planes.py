@@ -6,7 +6,7 @@ import numpy as np
 
 from tests.cuda.harness import scenario
 from tgslam.camera import Camera
-from tgslam.config.schema import PlanesConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.device import runtime
 from tgslam.planes.segmentation.extraction import extract_planes
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from tests.cuda.harness import scenario
 from tgslam.camera import Camera
-from tgslam.config.schema import LossConfig, MappingConfig, StructureConfig, SyntheticConfig
+from tgslam.config.input_settings import SyntheticConfig
+from tgslam.config.map_settings import LossConfig, MappingConfig, StructureConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.geometry import se3_exp
 from tgslam.map.gaussians import PARAMETERS, GaussianMap

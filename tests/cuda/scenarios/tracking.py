@@ -6,7 +6,8 @@ import numpy as np
 
 from tests.cuda.harness import scenario
 from tgslam.camera import Camera
-from tgslam.config.schema import LossConfig, TrackingConfig
+from tgslam.config.map_settings import LossConfig
+from tgslam.config.tracking_settings import TrackingConfig
 from tgslam.device import runtime
 from tgslam.geometry import se3_exp
 from tgslam.kernels import alignment

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.config.schema import ClosureConfig
+from tgslam.config.graph_settings import ClosureConfig
 from tgslam.graph.relative import PlanePairs, information_gain, of_planes
 from tgslam.planes.estimate import PlaneEstimate, stacked
 

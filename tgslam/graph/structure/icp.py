@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.schema import ClosureConfig
+from tgslam.config.graph_settings import ClosureConfig
 from tgslam.device import runtime
 from tgslam.geometry import adjoint, inverse
 from tgslam.graph.relative import Measurement, PlanePairs, Quadratic, of_planes, solve

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.schema import ClosureConfig
+from tgslam.config.graph_settings import ClosureConfig
 from tgslam.geometry import inverse
 from tgslam.graph.gating import passes
 from tgslam.graph.relative import Measurement, measure

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.schema import LoopConfig
+from tgslam.config.graph_settings import LoopConfig
 from tgslam.ops.image import DEPTH_EDGE
 from tgslam.types import FloatImage
 

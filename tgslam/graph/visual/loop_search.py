@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.schema import LoopConfig
+from tgslam.config.graph_settings import LoopConfig
 from tgslam.geometry import inverse, se3_log
 from tgslam.graph.gating import passes
 from tgslam.graph.structure.search import Closure, Findings, Relative

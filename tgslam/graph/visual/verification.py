@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.schema import LoopConfig
+from tgslam.config.graph_settings import LoopConfig
 from tgslam.device import runtime
 from tgslam.geometry import adjoint, inverse, transform_points
 from tgslam.graph.relative import Measurement, Quadratic, solve

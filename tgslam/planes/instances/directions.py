@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from tgslam.config.schema import PlanesConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.planes.instances.instance import NO_ID, PlanarInstance
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.config.schema import PlanesConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.geometry import transform_points
 from tgslam.planes.estimate import PlaneEstimate, concatenated, fuse
 from tgslam.planes.identity import palette

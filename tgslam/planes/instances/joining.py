@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.config.schema import PlanesConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.planes.estimate import offset_sigmas, stacked
 from tgslam.planes.instances.association import gate
 from tgslam.planes.instances.instance import NO_ID, PlanarInstance

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.config.schema import PlanesConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.geometry import inverse, transform_points
 from tgslam.planes.estimate import stacked
 from tgslam.planes.instances.instance import PlanarInstance

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from tgslam.config.schema import PlanesConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.geometry import inverse
 from tgslam.planes.estimate import PlaneEstimate, deviation_sigmas, from_segments, fuse, stacked
 from tgslam.planes.instances.association import Agreement, Overlap, assign, gate, matching_cost, overlap

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.schema import PlanesConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.geometry import inverse
 from tgslam.planes.estimate import PlaneEstimate
 from tgslam.planes.instances.directions import stands_as_known

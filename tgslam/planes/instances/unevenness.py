@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.config.schema import PlanesConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.planes.instances.instance import NO_ID, PlanarInstance
 
 _LARGER = 4.0  # times as large as its part is a surface

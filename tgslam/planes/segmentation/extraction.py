@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from tgslam.camera import Camera
-from tgslam.config.schema import PlanesConfig
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.device import runtime
 from tgslam.ops.plane_fit import CellGrid, Floats, Indices, PixelLabels
 from tgslam.planes.segment import PlaneSegment, PlaneView
