@@ -26,8 +26,8 @@ class ClosureConfig:
         0.0003,
         1e-5,
         1.0,
-        doc="By what a surface strays from its plane in one view and not in others. Most of it all views see alike: that "
-        "shifts the plane, and no keyframe",
+        doc="By what a surface strays from its plane in one view and not in others. Most of it all views see alike: "
+        "that shifts the plane, and no keyframe",
     )
     relinearise: float = setting(0.02, 0.0, 1.0, doc="rad and m; with solver: incremental")
     # Structure closures (formulation: closures or both): which keyframes are compared, and what of it becomes an edge
