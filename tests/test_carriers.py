@@ -3,50 +3,39 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tgslam.mapping.carriers import Carriers
+from tgslam.map.gaussians import CARRIERS
+from tgslam.mapping.carriers import CarrierDraw
 
 
-def carriers(rows: int, seed: int = 0) -> Carriers:
+def seeded(rows: int) -> NDArray[np.int32]:
     """Rows that the keyframe 0 has seeded."""
-    result = Carriers(np.random.default_rng(seed))
-    result.append(np.zeros(rows, np.int32))
-    return result
+    return np.zeros((rows, CARRIERS), np.int32)
 
 
 def test_each_keyframe_is_held_as_often_as_its_weight_has_it() -> None:
     """Weights 1, 1, 2, 4: what the fusion of depth would have made of them, by its gains."""
     weights, shares = np.array([1.0, 1.0, 2.0, 4.0]), np.zeros(4)
     for seed in range(500):
-        sample = carriers(2, seed)
+        draw, sample = CarrierDraw(np.random.default_rng(seed)), seeded(1)
         for k in range(1, 4):
-            sample.learn(np.array([1]), k, np.array([weights[k] / weights[: k + 1].sum()]))
-        assert (sample.keyframes[0] == 0).all()
-        shares += np.bincount(sample.keyframes[1], minlength=4) / sample.keyframes.shape[1] / 500
+            sample = draw(sample, k, np.array([weights[k] / weights[: k + 1].sum()]))
+        shares += np.bincount(sample[0], minlength=4) / CARRIERS / 500
     np.testing.assert_allclose(shares, weights / weights.sum(), atol=0.02)
 
 
-def test_a_draw_takes_a_share_of_the_slots_within_one() -> None:
-    gain = np.linspace(0.0, 1.0, 41)
-    sample = carriers(len(gain))
-    sample.learn(np.arange(len(gain)), 1, gain)
-    slots = sample.keyframes.shape[1]
-    assert (np.abs((sample.keyframes == 1).sum(axis=1) - slots * gain) < 1.0).all()
+def test_a_draw_takes_a_share_of_the_slots_within_one_and_changes_nothing_given() -> None:
+    gain, before = np.linspace(0.0, 1.0, 41), seeded(41)
+    sample = CarrierDraw(np.random.default_rng(0))(before, 1, gain)
+    assert (np.abs((sample == 1).sum(axis=1) - CARRIERS * gain) < 1.0).all()
+    assert not before.any()
+    assert sample.dtype == np.int32
 
 
 def test_rows_with_one_history_have_the_same_carriers() -> None:
     """So that neighbours move alike."""
-    sample, rng = carriers(10), np.random.default_rng(1)
+    draw, sample, rng = CarrierDraw(np.random.default_rng(0)), seeded(10), np.random.default_rng(1)
     for k in range(1, 30):
-        sample.learn(np.arange(10), k, np.full(10, rng.random()))
-    assert (sample.keyframes == sample.keyframes[0]).all()
-
-
-def test_rows_come_and_go() -> None:
-    sample = carriers(3)
-    sample.learn(np.array([2]), 5, np.array([1.0]))
-    sample.append(sample.keyframes[[2, 0]])
-    sample.append(np.array([7], np.int32))
-    sample.keep(np.array([False, True, True, True, True, True]))
-    assert [set(row) for row in sample.keyframes.tolist()] == [{0}, {5}, {5}, {0}, {7}]
-    assert sample.keyframes.dtype == np.int32
+        sample = draw(sample, k, np.full(10, rng.random()))
+    assert (sample == sample[0]).all()

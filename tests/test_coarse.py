@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from tgslam.camera import Camera
 from tgslam.map.gaussians import GaussianMap
-from tgslam.map.keyframe import Keyframe
+from tgslam.map.keyframes import Keyframe
 from tgslam.mapping.coarse import halved, seen_in_part, seen_whole
 from tgslam.mapping.surface import Surface
 from tgslam.ops.rasterize import Rasterizer
@@ -46,11 +46,11 @@ def exact_depth_m() -> np.ndarray:
 def keyframe() -> Keyframe:
     colour = np.full((CAMERA.height, CAMERA.width, 3), 0.5, np.float32)
     frame = Frame(0, 0.0, colour, exact_depth_m())
-    return Keyframe.from_frame(frame, np.eye(4), Exposure(), np.eye(6))
+    return Keyframe(frame, np.eye(4), Exposure(), np.eye(6))
 
 
 def surface_of(gaussians: GaussianMap, keyframe: Keyframe) -> Surface:
-    return Surface(keyframe, CAMERA, gaussians, 0.05)
+    return Surface(keyframe.depth_m(), keyframe.T_cw, CAMERA, gaussians, 0.05)
 
 
 def test_parts_tile_what_they_are_parts_of(keyframe: Keyframe) -> None:

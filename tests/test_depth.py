@@ -6,6 +6,7 @@ import pytest
 from tests.reference import depth as reference
 from tgslam.device import runtime
 from tgslam.kernels import depth as kernels
+from tgslam.map import holes
 from tgslam.ops import depth
 
 SIGMA = 0.0015
@@ -104,7 +105,7 @@ def test_holes_of_a_plane_are_filled_closely(kind):
     else:
         hole = rng.random(exact_m.shape) < (0.3 if kind == "random" else 0.9)
     depth_m = np.where(hole, np.float32(0.0), exact_m)
-    filled = depth.filled(depth_m, FOCAL_PX).depth_m
+    filled = holes.filled(depth_m, FOCAL_PX).depth_m
     assert filled.dtype == np.float32
     np.testing.assert_array_equal(filled[~hole], exact_m[~hole])
     error = abs(filled - exact_m)[hole] / exact_m[hole]
@@ -116,7 +117,7 @@ def test_a_hole_at_an_edge_is_guessed_on_one_of_the_two_surfaces(width_px):
     exact_m = np.where(np.arange(64) < 32, np.float32(1.0), np.float32(3.0)) * np.ones((48, 1), np.float32)
     depth_m = exact_m.copy()
     depth_m[:, 31 : 31 + width_px] = 0.0
-    guess = depth.filled(depth_m, FOCAL_PX).depth_m
+    guess = holes.filled(depth_m, FOCAL_PX).depth_m
     assert set(np.unique(guess)) == {1.0, 3.0}
     assert (np.diff(guess, axis=1) >= 0).all()
 
@@ -127,7 +128,7 @@ def test_what_is_too_grazing_for_depth_is_not_guessed_in_the_air():
     ratio = (np.arange(64) * np.ones((48, 1)) - 1.0) / focal_px  # x / z
     front, side = ratio > corner_m, (ratio <= corner_m) & (ratio > corner_m / 1.3)
     depth_m = np.where(side, 0.0, np.where(front, 1.0, wall_m)).astype(np.float32)
-    guess = depth.filled(depth_m, focal_px)
+    guess = holes.filled(depth_m, focal_px)
     z = guess.depth_m[side].astype(np.float64)
     x = ratio[side] * z
     off_m = np.stack(
@@ -153,7 +154,7 @@ def test_a_floor_that_becomes_too_grazing_goes_on_to_the_wall():
     exact_m = np.minimum(floor_m, 6.0)
     hole = (floor_m > 2.2) & (floor_m < 6.0)
     noise = 1.0 + SIGMA * np.random.default_rng(0).normal(size=exact_m.shape) * exact_m
-    guess = depth.filled(np.where(hole, 0.0, exact_m * noise).astype(np.float32), focal_px)
+    guess = holes.filled(np.where(hole, 0.0, exact_m * noise).astype(np.float32), focal_px)
     assert hole.sum() > 1000 and not (guess.source >= 0).any()
     error = abs(guess.depth_m - exact_m)[hole] / exact_m[hole]
     assert np.median(error) < 0.1 and error.max() < 0.3
@@ -163,8 +164,8 @@ def test_a_wide_hole_in_a_slope_is_bridged():
     exact_m = plane()
     depth_m = exact_m.copy()
     depth_m[:, 20:44] = 0.0
-    guess = depth.filled(depth_m, FOCAL_PX).depth_m
-    constant = depth_m.ravel()[depth.nearest_measured(depth_m)]
+    guess = holes.filled(depth_m, FOCAL_PX).depth_m
+    constant = depth_m.ravel()[holes.nearest_measured(depth_m)]
     assert abs(guess - exact_m).mean() < 0.5 * abs(constant - exact_m).mean()
 
 
@@ -172,7 +173,7 @@ def test_the_nearest_measurement_is_the_nearest_one():
     depth_m = np.float32(ragged(20, 30, seed=5))
     depth_m[4:15, 8:22] = 0.0
     rows, columns = np.nonzero(depth_m)
-    found_rows, found_columns = np.divmod(depth.nearest_measured(depth_m), 30)
+    found_rows, found_columns = np.divmod(holes.nearest_measured(depth_m), 30)
     assert (depth_m[found_rows, found_columns] > 0).all()
     v, u = np.mgrid[:20, :30]
     least = np.hypot(v[..., None] - rows, u[..., None] - columns).min(-1)
@@ -181,7 +182,7 @@ def test_the_nearest_measurement_is_the_nearest_one():
 
 def test_guesses_stay_between_the_nearest_and_the_farthest_measurement():
     depth_m = np.float32(ragged(45, 33, seed=4))
-    filled = depth.filled(depth_m, FOCAL_PX).depth_m
+    filled = holes.filled(depth_m, FOCAL_PX).depth_m
     known = depth_m[depth_m > 0]
     assert filled.min() >= known.min() * (1 - 1e-5) and filled.max() <= known.max() * (1 + 1e-5)
     np.testing.assert_array_equal(filled[depth_m > 0], known)
@@ -191,13 +192,13 @@ def test_guesses_stay_between_the_nearest_and_the_farthest_measurement():
 def test_a_single_measurement_fills_the_image(size):
     depth_m = np.zeros(size, np.float32)
     depth_m[-1, size[1] // 2] = 2.5
-    np.testing.assert_allclose(depth.filled(depth_m, FOCAL_PX).depth_m, 2.5, rtol=1e-5)
+    np.testing.assert_allclose(holes.filled(depth_m, FOCAL_PX).depth_m, 2.5, rtol=1e-5)
 
 
 def test_nothing_to_fill_or_to_fill_from():
     full, empty = plane(), np.zeros((7, 9), np.float32)
-    np.testing.assert_array_equal(depth.filled(full, FOCAL_PX).depth_m, full)
-    np.testing.assert_array_equal(depth.filled(empty, FOCAL_PX).depth_m, empty)
+    np.testing.assert_array_equal(holes.filled(full, FOCAL_PX).depth_m, full)
+    np.testing.assert_array_equal(holes.filled(empty, FOCAL_PX).depth_m, empty)
 
 
 @pytest.mark.parametrize("beyond_sigmas", [-0.7, -0.3, 0.0, 1.0])
@@ -232,5 +233,5 @@ def test_a_wall_within_range_keeps_its_depth_and_holes_cost_a_few_pixels():
 def test_filling_leaves_its_input_alone():
     depth_m = np.float32(ragged(20, 30))
     before = depth_m.copy()
-    depth.filled(depth_m, FOCAL_PX)
+    holes.filled(depth_m, FOCAL_PX)
     np.testing.assert_array_equal(depth_m, before)

@@ -9,14 +9,13 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from tests.mapper import Mapper
 from tgslam.config.input_settings import SyntheticConfig
-from tgslam.config.map_settings import LossConfig, MappingConfig, SeedingConfig
+from tgslam.config.map_settings import LossConfig, MappingConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, so3_exp, transform_points
-from tgslam.map.keyframe import Keyframe
 from tgslam.mapping.fusion import depth_pyramid, fused_depth, sample, turned
-from tgslam.mapping.mapper import Mapper
-from tgslam.types import Exposure, Frame
+from tgslam.types import Frame
 
 SIGMA_PER_M2 = LossConfig().depth_sigma_per_m2
 
@@ -232,12 +231,11 @@ def source() -> SyntheticSource:
 
 def make_mapper(source: SyntheticSource) -> Mapper:
     """Without refinement: what then changes of the geometry is fusion's doing."""
-    mapping = MappingConfig(iterations=0, refine_poses=False)
-    return Mapper(source.camera, mapping, SeedingConfig(), LossConfig(), np.random.default_rng(0))
+    return Mapper(source.camera, MappingConfig(iterations=0, refine_poses=False))
 
 
-def keyframe(source: SyntheticSource, frame: Frame, T_wc: NDArray[np.float64]) -> Keyframe:
-    return Keyframe.from_frame(frame, inverse(T_wc) @ source.pose(0), Exposure(), np.eye(6))
+def add(mapper: Mapper, source: SyntheticSource, frame: Frame, T_wc: NDArray[np.float64]) -> None:
+    mapper.add(frame, inverse(T_wc) @ source.pose(0))
 
 
 def off_sigmas(
@@ -246,7 +244,7 @@ def off_sigmas(
     """Depth errors, in sigmas of the sensor there, of the first keyframe's Gaussians that lie well inside surfaces."""
     camera = source.camera
     x = transform_points(T_cw, mapper.gaussians.host("mean"))
-    first = (mapper.gaussians.host("birth_keyframe") == 0) & ~mapper.guessed & (x[:, 2] > 0.05)
+    first = (mapper.gaussians.host("birth_keyframe") == 0) & ~mapper.known("guessed") & (x[:, 2] > 0.05)
     x = x[first]
     u = (camera.fx * x[:, :1] / x[:, 2:] + camera.cx).astype(np.float32)
     v = (camera.fy * x[:, 1:2] / x[:, 2:] + camera.cy).astype(np.float32)
@@ -263,11 +261,11 @@ def test_keyframes_of_a_noisy_sensor_average_out(source: SyntheticSource) -> Non
     mapper, exact_m = make_mapper(source), source.clean(0).depth_m
     errors, known = [], []
     for index in range(0, 24, 4):
-        mapper.add_keyframe(keyframe(source, source.read(index), source.pose(index)))
+        add(mapper, source, source.read(index), source.pose(index))
         off = off_sigmas(mapper, source, np.eye(4), exact_m)
         assert len(off) > 2000
         errors.append(np.median(np.abs(off)))
-        known.append(np.median(mapper.information[mapper.gaussians.host("birth_keyframe") == 0]))
+        known.append(np.median(mapper.known("information")[mapper.gaussians.host("birth_keyframe") == 0]))
     assert (np.diff(errors) < 0).all()
     assert errors[-1] < 0.75 * errors[0]
     assert (np.diff(known) > 0).all()
@@ -276,9 +274,9 @@ def test_keyframes_of_a_noisy_sensor_average_out(source: SyntheticSource) -> Non
 def test_no_keyframe_makes_the_map_forget_what_it_measured(source: SyntheticSource) -> None:
     mapper = make_mapper(source)
     for index in range(0, 16, 4):
-        mapper.add_keyframe(keyframe(source, source.read(index), source.pose(index)))
-    assert (mapper.information[~mapper.guessed] > 0).all()
-    assert (mapper.information[mapper.guessed] == 0).all()
+        add(mapper, source, source.read(index), source.pose(index))
+    assert (mapper.known("information")[~mapper.known("guessed")] > 0).all()
+    assert (mapper.known("information")[mapper.known("guessed")] == 0).all()
 
 
 def test_a_near_view_corrects_what_was_seen_from_afar(source: SyntheticSource) -> None:
@@ -292,7 +290,7 @@ def test_a_near_view_corrects_what_was_seen_from_afar(source: SyntheticSource) -
     for index, (T_wc, wrong_sigmas) in enumerate([(far, 2.0), (far, 2.0), (far, 2.0), (near, 0.0)]):
         colour, view = source._raycaster.render(T_wc)
         depth_m = view.depth_m + np.float32(wrong_sigmas * SIGMA_PER_M2) * view.depth_m**2
-        mapper.add_keyframe(keyframe(source, Frame(index, index / 30, colour, depth_m), T_wc))
+        add(mapper, source, Frame(index, index / 30, colour, depth_m), T_wc)
         off = off_sigmas(mapper, source, T_cw, exact_m)
         assert len(off) > 500
         residual.append(np.median(off))

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tgslam.map.gaussians import PARAMETERS, GaussianMap, grown
+from tgslam.map.gaussians import CARRIERS, PARAMETERS, GaussianMap
+from tgslam.map.table import Column, Table
 from tgslam.ops.splats import MapGradient
 from tgslam.types import Gaussians
 
@@ -66,7 +67,7 @@ def test_append_doubles_the_capacity() -> None:
         capacities.append(gaussian_map.capacity)
     assert capacities == [4] * 4 + [8] * 4 + [16]
     assert_rows(gaussian_map, list(range(9)))
-    assert all(len(getattr(gaussian_map, name)) == 16 for name in FIELDS)
+    assert all(len(gaussian_map.array(name)) == 16 for name in FIELDS)
 
 
 def test_append_more_than_double() -> None:
@@ -113,9 +114,62 @@ def test_host_shows_the_rows_in_use() -> None:
         np.testing.assert_array_equal(gaussian_map.host(name), getattr(numbered(0, 3), name))
 
 
-def test_grown_pads_with_zeros() -> None:
-    larger = grown(np.ones((4, 3), np.float32), 2, 7)
-    np.testing.assert_array_equal(larger, [[1.0] * 3] * 2 + [[0.0] * 3] * 5)
+# Everything else that is known of a row
+
+OTHERS = ("carriers", "contribution", "views", "guessed", "information", "support", "conflict")
+
+
+def known(ids: np.ndarray) -> dict[str, np.ndarray]:
+    """Values of the other columns that tell which row it is."""
+    return {
+        "carriers": np.repeat(ids[:, None], CARRIERS, 1).astype(np.int32) + np.arange(CARRIERS, dtype=np.int32),
+        "contribution": ids.astype(np.float32) / 3,
+        "views": ids.astype(np.int32) + 1,
+        "guessed": ids % 3 == 1,
+        "information": ids / 7,
+        "support": ids.astype(np.int32) * 2,
+        "conflict": ids.astype(np.int32) * 5,
+    }
+
+
+@settings(max_examples=20)
+@given(st.lists(st.tuples(st.integers(0, 20), st.integers(0, 2**31 - 1)), max_size=6), st.integers(1, 8))
+def test_all_that_is_known_of_rows_stays_in_step(steps: list[tuple[int, int]], capacity: int) -> None:
+    gaussian_map, ids = GaussianMap(capacity), np.zeros(0, np.intp)
+    gaussian_map.add_columns([Column("own", 2), Column("count", dtype=np.int32, on_host=True)])
+    for count, seed in steps:
+        first = int(ids.max(initial=-1)) + 1
+        new = np.arange(first, first + count)
+        gaussian_map.append(numbered(first, count), **known(new), own=np.stack([new, -new], 1))
+        ids = np.concatenate([ids, new])
+        mask = np.random.default_rng(seed).random(len(ids)) > 0.3
+        gaussian_map.keep(mask)
+        ids = ids[mask]
+    assert_rows(gaussian_map, ids.tolist())
+    for name, values in known(ids).items():
+        np.testing.assert_array_equal(gaussian_map.host(name), values, err_msg=name)
+        assert gaussian_map.host(name).dtype == values.dtype
+    np.testing.assert_array_equal(gaussian_map.host("own"), np.stack([ids, -ids], 1))
+    np.testing.assert_array_equal(gaussian_map.host("count"), 0)
+
+
+def test_new_rows_are_followed_by_nothing_of_those_that_left() -> None:
+    gaussian_map = GaussianMap(4)
+    gaussian_map.append(numbered(0, 4), **known(np.arange(1, 5)))
+    gaussian_map.keep(np.zeros(4, bool))
+    gaussian_map.append(numbered(0, 3))
+    for name in OTHERS[1:]:
+        assert not gaussian_map.host(name).any(), name
+    np.testing.assert_array_equal(gaussian_map.host("carriers"), np.repeat([[0], [3], [6]], CARRIERS, 1))
+
+
+def test_wrong_masks_and_columns_are_refused() -> None:
+    table = Table([Column("a")], 4)
+    table.append(3, {})
+    with pytest.raises(ValueError, match=r"mask must have shape \[3\]"):
+        table.keep(np.ones(4, bool))
+    with pytest.raises(ValueError, match="a column 'a' already"):
+        table.add_column(Column("a"))
 
 
 def test_gradients_have_the_shapes_of_their_parameters() -> None:

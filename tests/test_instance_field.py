@@ -8,7 +8,7 @@ import pytest
 from tests.reference import instance_field as reference
 from tests.test_loss_kernels import assert_gradient, central
 from tgslam.bench.ablation import identity_study as identity
-from tgslam.config.map_settings import StructureConfig
+from tgslam.config.plane_settings import StructureConfig
 from tgslam.device import runtime
 from tgslam.kernels import instance_field as kernels
 from tgslam.ops import instance_field

@@ -20,8 +20,8 @@ RANKS = (
     {"ops"},
     {"planes", "synthetic"},
     {"map"},
-    {"graph", "keyframing", "mapping", "tracking"},
-    {"datasets", "slam"},
+    {"graph", "keyframing", "mapping", "preparation", "tracking"},
+    {"assembly", "datasets", "record", "slam"},
     {"evaluation", "output"},
     {"pipeline"},
     {"bench"},
@@ -30,7 +30,7 @@ RANKS = (
 )
 RANKED = {name: rank for rank, names in enumerate(RANKS) for name in names}
 # What must never see ground truth
-SYSTEM = {"graph", "keyframing", "map", "mapping", "planes", "slam", "tracking"}
+SYSTEM = {"assembly", "graph", "keyframing", "map", "mapping", "planes", "preparation", "record", "slam", "tracking"}
 # Rooms that hold kernels' arguments themselves; all others go through `ops`
 KERNEL_USERS = {"kernels", "ops", "synthetic", "bench"}
 
@@ -166,3 +166,33 @@ def test_no_module_name_is_used_twice() -> None:
     assert not kernels & others
     folders = {path.name for path in (CHECKOUT / "tgslam").rglob("*") if path.is_dir()}
     assert not folders & set(stems), "a module and a room of one name"
+
+
+def stored_attributes(tree: ast.Module, *, of_others: bool) -> set[str]:
+    """Names of attributes that the module assigns to, by statement or setattr; of_others: those of `self` left out."""
+    stored = (n for n in ast.walk(tree) if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store))
+    calls = (n for n in ast.walk(tree) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name))
+    by_setattr = {ast.unparse(call.args[1]).strip("'") for call in calls if call.func.id == "setattr"}  # type: ignore[attr-defined]
+    return by_setattr | {n.attr for n in stored if not (of_others and ast.unparse(n.value) == "self")}
+
+
+def written_views(tree: ast.Module) -> set[str]:
+    """What the module writes into through a view of a column: `x.host("mean")[rows] = y`."""
+    stored = (n for n in ast.walk(tree) if isinstance(n, ast.Subscript) and isinstance(n.ctx, ast.Store))
+    views = (n.value for n in stored if isinstance(n.value, ast.Call) and isinstance(n.value.func, ast.Attribute))
+    return {ast.unparse(view) for view in views if view.func.attr in ("host", "array")}  # type: ignore[attr-defined]
+
+
+def test_keyframe_poses_are_assigned_in_one_module() -> None:
+    poses = {"T_cw", "_T_cw", "_exposure", "_labels"}
+    setters = {name for name, tree in MODULES.items() if stored_attributes(tree, of_others=True) & poses}
+    assert setters == {"map.keyframes"}
+
+
+def test_columns_of_gaussians_are_assigned_in_one_module() -> None:
+    owner = "map.table"
+    assert "capacity" in stored_attributes(MODULES[owner], of_others=False)
+    columns = {"mean", "log_scale", "quat_wxyz", "opacity_logit", "plane_id", "birth_keyframe", "carriers", "capacity"}
+    for name in (name for name in MODULES if parts(name) in SYSTEM and name != owner):
+        assert not stored_attributes(MODULES[name], of_others=True) & columns, name
+        assert not written_views(MODULES[name]), name

@@ -9,19 +9,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tests.mapper import Mapper
 from tgslam.config.input_settings import SyntheticConfig
-from tgslam.config.map_settings import LossConfig, MappingConfig, SeedingConfig, StructureConfig
-from tgslam.config.plane_settings import PlanesConfig
+from tgslam.config.map_settings import LossConfig, MappingConfig
+from tgslam.config.plane_settings import PlanesConfig, StructureConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.device.stopwatch import Stopwatch
 from tgslam.evaluation.image_metrics import psnr
 from tgslam.geometry import inverse, se3_exp, se3_log, transform_points
 from tgslam.kernels.simd import ALPHA_MIN
-from tgslam.map.keyframe import Keyframe
-from tgslam.mapping.mapper import Mapper
+from tgslam.map.gaussians import GaussianMap
+from tgslam.map.keyframes import Keyframe
 from tgslam.mapping.refinement import Refiner
 from tgslam.mapping.surface import Projection
 from tgslam.ops.rasterize import Rasterizer
+from tgslam.ops.vector_adam import VectorAdam
 from tgslam.planes.identity.codes import codes_of, read_ids
 from tgslam.synthetic import sensor
 from tgslam.types import Exposure, Frame, Gaussians, Rendering
@@ -33,7 +35,7 @@ def source() -> SyntheticSource:
 
 
 def make_mapper(source: SyntheticSource, **settings: Any) -> Mapper:
-    return Mapper(source.camera, MappingConfig(**settings), SeedingConfig(), LossConfig(), np.random.default_rng(0))
+    return Mapper(source.camera, MappingConfig(**settings))
 
 
 def true_T_cw(source: SyntheticSource, index: int) -> NDArray[np.float64]:
@@ -41,34 +43,19 @@ def true_T_cw(source: SyntheticSource, index: int) -> NDArray[np.float64]:
     return inverse(source.pose(index)) @ source.pose(0)
 
 
-def keyframe(source: SyntheticSource, frame: Frame, T_cw: NDArray | None = None, gain: float = 1.0) -> Keyframe:
-    pose = true_T_cw(source, frame.index) if T_cw is None else T_cw
-    return Keyframe.from_frame(frame, pose, Exposure(gain), np.eye(6))
+def add(mapper: Mapper, source: SyntheticSource, frame: Frame, T_cw: NDArray | None = None, gain: float = 1.0) -> None:
+    """A keyframe, by default at its true pose."""
+    mapper.add(frame, true_T_cw(source, frame.index) if T_cw is None else T_cw, Exposure(gain))
 
 
 def view(mapper: Mapper, T_cw: NDArray) -> Rendering:
     return Rasterizer(mapper.camera).render(mapper.gaussians, T_cw)
 
 
-def rows_of(owner: object) -> dict[str, NDArray]:
-    """What the mapper keeps by the Gaussian."""
-    return {name: value for name, value in vars(owner).items() if isinstance(value, np.ndarray)}
-
-
-def assert_rows_agree(mapper: Mapper) -> None:
-    """Everything that is kept by the Gaussian has as many rows as the map."""
-    refiner = mapper.refiner
-    rows = {**rows_of(mapper), "contribution": refiner.contribution, "views": refiner.views}
-    rows["carriers"] = mapper.carriers.keyframes
-    assert {"support", "conflict"} <= set(rows)
-    assert refiner.adam.rows == mapper.gaussians.count
-    assert {name: len(array) for name, array in rows.items()} == dict.fromkeys(rows, mapper.gaussians.count)
-
-
 def mapped(source: SyntheticSource, indices: range, **settings: Any) -> Mapper:
     mapper = make_mapper(source, **settings)
     for index in indices:
-        mapper.add_keyframe(keyframe(source, source.read(index)))
+        add(mapper, source, source.read(index))
     return mapper
 
 
@@ -94,19 +81,18 @@ PATCH = (slice(40, 80), slice(60, 100))
 
 def test_the_first_keyframe_is_mapped_whole(source: SyntheticSource) -> None:
     mapper = make_mapper(source, iterations=0)
-    mapper.add_keyframe(keyframe(source, source.read(0)))
+    add(mapper, source, source.read(0))
     rendering = view(mapper, np.eye(4))
     assert (rendering.opacity > 0.9).mean() > 0.97
     assert psnr(rendering.colour, source.clean(0).colour) > 25.5
-    assert_rows_agree(mapper)
 
 
 def test_what_the_map_shows_already_is_not_inserted_again(source: SyntheticSource) -> None:
     mapper = make_mapper(source)
-    mapper.add_keyframe(keyframe(source, source.read(0)))
+    add(mapper, source, source.read(0))
     first = mapper.gaussians.count
     for index in range(1, 4):
-        mapper.add_keyframe(keyframe(source, replace(source.read(0), index=index), np.eye(4)))
+        add(mapper, source, replace(source.read(0), index=index), np.eye(4))
     born = np.bincount(mapper.gaussians.host("birth_keyframe"))
     assert born[0] > 4000
     assert born[1:].sum() < 0.03 * born[0]
@@ -115,10 +101,10 @@ def test_what_the_map_shows_already_is_not_inserted_again(source: SyntheticSourc
 
 def test_a_new_area_is_inserted_where_it_is(source: SyntheticSource) -> None:
     mapper = make_mapper(source, iterations=0)
-    mapper.add_keyframe(keyframe(source, source.clean(0)))
+    add(mapper, source, source.clean(0))
     T_cw = true_T_cw(source, 60)
     was_open = view(mapper, T_cw).opacity < 0.5
-    mapper.add_keyframe(keyframe(source, source.clean(60)))
+    add(mapper, source, source.clean(60))
     rendering = view(mapper, T_cw)
     assert 0.1 < was_open.mean() < 0.6
     assert (rendering.opacity[was_open] > 0.8).mean() > 0.97
@@ -131,12 +117,12 @@ def test_a_new_area_is_inserted_where_it_is(source: SyntheticSource) -> None:
 def test_what_stands_in_front_of_the_map_is_inserted(source: SyntheticSource) -> None:
     mapper = make_mapper(source, iterations=0)
     frame = source.clean(0)
-    mapper.add_keyframe(keyframe(source, frame))
+    add(mapper, source, frame)
     before = mapper.gaussians.count
     depth_m, colour = frame.depth_m.copy(), frame.colour.copy()
     depth_m[PATCH] *= 0.6
     colour[PATCH] = (1.0, 0.0, 0.0)
-    mapper.add_keyframe(keyframe(source, replace(frame, index=1, depth_m=depth_m, colour=colour), np.eye(4)))
+    add(mapper, source, replace(frame, index=1, depth_m=depth_m, colour=colour), np.eye(4))
     new = mapper.gaussians.host("birth_keyframe") == 1
     inside = in_patch(source, mapper.gaussians.host("mean")[new], PATCH)
     means = mapper.gaussians.host("mean")[new][inside]
@@ -157,7 +143,7 @@ def test_holes_of_the_depth_image_are_mapped_at_a_guess(source: SyntheticSource)
     frame = source.clean(0)
     depth_m = frame.depth_m.copy()
     depth_m[50:60, 70:80] = 0.0
-    mapper.add_keyframe(keyframe(source, replace(frame, depth_m=depth_m)))
+    add(mapper, source, replace(frame, depth_m=depth_m))
     rendering = view(mapper, np.eye(4))
     hole = (slice(50, 60), slice(70, 80))
     assert rendering.opacity[hole].min() > 0.7
@@ -173,8 +159,8 @@ def test_a_guess_does_not_hang_before_a_camera_that_goes_on(source: SyntheticSou
     nearest_m = []
     for ahead_m in (0.0, 1.0, 2.0, 3.0):
         forward = se3_exp([0.0, 0.0, 0.0, 0.0, 0.0, -ahead_m])
-        mapper.add_keyframe(keyframe(source, replace(frame, depth_m=depth_m), forward))
-        in_hole = mapper.guessed & (np.abs(mapper.gaussians.host("mean")[:, :2]) < 0.3).all(axis=1)
+        add(mapper, source, replace(frame, depth_m=depth_m), forward)
+        in_hole = mapper.known("guessed") & (np.abs(mapper.gaussians.host("mean")[:, :2]) < 0.3).all(axis=1)
         assert in_hole.any()
         nearest_m.append(mapper.gaussians.host("mean")[in_hole, 2].min() - ahead_m)
     assert min(nearest_m) > 0.75 * nearest_m[0]
@@ -188,7 +174,7 @@ def test_a_static_scene_seen_for_long_does_not_fill_up(source: SyntheticSource) 
         rng = np.random.default_rng(index)
         noisy_m = sensor.noisy_depth(exact.depth_m, geometry.cosine, rng)
         frame = Frame(index, index / 30, sensor.noisy_colour(colour, rng), noisy_m)
-        mapper.add_keyframe(keyframe(source, frame, np.eye(4)))
+        add(mapper, source, frame, np.eye(4))
         counts.append(mapper.gaussians.count)
     assert max(counts) < 1.05 * counts[0]
 
@@ -201,15 +187,14 @@ def test_floaters_go_once_two_keyframes_have_seen_through_them(source: Synthetic
     frame = source.read(0)
     spoiled_m = frame.depth_m.copy()
     spoiled_m[PATCH] *= 0.5  # somebody walked by
-    mapper.add_keyframe(keyframe(source, replace(frame, depth_m=spoiled_m)))
+    add(mapper, source, replace(frame, depth_m=spoiled_m))
     counts = [floating(mapper, source).sum()]
     for index in (3, 6, 9):
-        mapper.add_keyframe(keyframe(source, source.read(index)))
+        add(mapper, source, source.read(index))
         counts.append(floating(mapper, source).sum())
     assert counts[0] > 100
     assert counts[1] > 0.9 * counts[0]  # one keyframe against one is no verdict
     assert counts[-1] == 0
-    assert_rows_agree(mapper)
 
 
 def floating(mapper: Mapper, source: SyntheticSource) -> NDArray[np.bool_]:
@@ -220,37 +205,27 @@ def floating(mapper: Mapper, source: SyntheticSource) -> NDArray[np.bool_]:
     return result
 
 
-def plant(mapper: Mapper, gaussians: Gaussians) -> None:
-    """Add Gaussians by hand, with their rows everywhere."""
-    mapper.gaussians.append(gaussians)
-    mapper.refiner.append(len(gaussians))
-    mapper.carriers.append(gaussians.birth_keyframe)
-    for name, array in rows_of(mapper).items():
-        setattr(mapper, name, np.append(array, np.zeros(len(gaussians), array.dtype)))
-
-
 def test_what_never_shows_goes(source: SyntheticSource) -> None:
     mapper = make_mapper(source, prune_weight_px=0.5)
-    mapper.add_keyframe(keyframe(source, source.read(0)))
+    add(mapper, source, source.read(0))
     seen = mapper.gaussians.gaussians()
     middle = in_patch(source, seen.mean, (slice(30, 90), slice(40, 120)))
     behind = Gaussians(**{field.name: getattr(seen, field.name)[middle] for field in fields(Gaussians)})
     # Small ones: a fresh surface is not quite opaque, and what shines through counts by its area
     behind = replace(behind, mean=1.3 * behind.mean, log_scale=behind.log_scale - np.float32(2.0))
-    plant(mapper, replace(behind, birth_keyframe=behind.birth_keyframe + 99))
+    marked = replace(behind, plane_id=np.full(middle.sum(), 99, np.int32))
+    mapper.gaussians.append(marked)
     for index in (3, 6):
-        mapper.add_keyframe(keyframe(source, source.read(index)))
-    born = np.bincount(mapper.gaussians.host("birth_keyframe"), minlength=100)
+        add(mapper, source, source.read(index))
+    left = mapper.gaussians.host("plane_id") == 99
     assert middle.sum() > 500
-
-    assert born[99] < 0.02 * middle.sum()
-    assert born[0] > 0.9 * len(seen)
-    assert_rows_agree(mapper)
+    assert left.sum() < 0.02 * middle.sum()
+    assert (mapper.gaussians.host("birth_keyframe")[~left] == 0).sum() > 0.9 * len(seen)
 
 
 def test_gaussians_that_have_faded_or_are_not_finite_go(source: SyntheticSource) -> None:
     mapper = make_mapper(source)
-    mapper.add_keyframe(keyframe(source, source.read(0)))
+    add(mapper, source, source.read(0))
     count = mapper.gaussians.count
     faded = mapper.gaussians.gaussians()
     faded.opacity_logit[:10] = -6.0
@@ -260,15 +235,13 @@ def test_gaussians_that_have_faded_or_are_not_finite_go(source: SyntheticSource)
     mapper.finish()
     assert count - 20 < mapper.gaussians.count <= count - 15
     assert np.isfinite(mapper.gaussians.host("mean")).all()
-    assert_rows_agree(mapper)
 
 
 @pytest.mark.parametrize("identity", ["colour", "scalar"])
 def test_new_gaussians_show_the_identity_of_their_plane(source: SyntheticSource, identity: str) -> None:
-    structure, rng = StructureConfig(identity=identity), np.random.default_rng(0)
-    config, planes = MappingConfig(iterations=0), PlanesConfig(enabled=True)
-    mapper = Mapper(source.camera, config, SeedingConfig(), LossConfig(), rng, planes, structure)
-    mapper.add_keyframe(keyframe(source, source.read(0)))
+    structure = StructureConfig(identity=identity)
+    mapper = Mapper(source.camera, MappingConfig(iterations=0), PlanesConfig(enabled=True), structure)
+    add(mapper, source, source.read(0))
     ids = mapper.gaussians.host("plane_id")
     assert len(np.unique(ids)) > 3
     shown = 1.0 / (1.0 + np.exp(-mapper.gaussians.host("embedding")))
@@ -282,10 +255,9 @@ def test_new_gaussians_show_the_identity_of_their_plane(source: SyntheticSource,
 @pytest.mark.parametrize("optimizer", ["relaxation", "adam"])
 def test_refinement_lowers_the_loss_and_raises_the_psnr(source: SyntheticSource, optimizer: str) -> None:
     mapper = make_mapper(source, iterations=0, optimizer=optimizer)
-    first = keyframe(source, source.read(0))
-    mapper.add_keyframe(first)
+    add(mapper, source, source.read(0))
     before_db = psnr(view(mapper, np.eye(4)).colour, source.clean(0).colour)
-    losses = [mapper.refiner.step(mapper.gaussians, first, move_pose=False).value for _ in range(20)]
+    losses = [mapper.refinement.refiner.step(mapper.keyframes[0]).loss.value for _ in range(20)]
     assert losses[5] < 0.9 * losses[0]
     assert losses[-1] < 0.65 * losses[0]
     assert psnr(view(mapper, np.eye(4)).colour, source.clean(0).colour) > before_db + 4.0
@@ -293,12 +265,9 @@ def test_refinement_lowers_the_loss_and_raises_the_psnr(source: SyntheticSource,
 
 def test_a_stopwatch_takes_the_stages_of_an_iteration(source: SyntheticSource) -> None:
     mapper = make_mapper(source, iterations=0)
-    first = keyframe(source, source.read(0))
-    mapper.add_keyframe(first)
-    stopwatch = Stopwatch()
-    refiner = Refiner(source.camera, mapper.config, mapper.loss, stopwatch)
-    refiner.append(mapper.gaussians.count)
-    refiner.step(mapper.gaussians, first, move_pose=False)
+    add(mapper, source, source.read(0))
+    stopwatch, gaussians = Stopwatch(), GaussianMap.from_gaussians(mapper.gaussians.gaussians())
+    Refiner(gaussians, source.camera, MappingConfig(), LossConfig(), stopwatch=stopwatch).step(mapper.keyframes[0])
     assert list(stopwatch.seconds) == ["forward", "loss", "backward", "update"]
     assert all(seconds > 0 for seconds in stopwatch.seconds.values())
 
@@ -318,21 +287,21 @@ def unseen_psnr(mapper: Mapper, source: SyntheticSource) -> float:
 
 
 def test_the_final_refinement_learns_what_keyframes_show_of_planes_in_the_end(source: SyntheticSource) -> None:
-    structure, rng = StructureConfig(pgi_interval=1), np.random.default_rng(0)
-    config, planes = MappingConfig(iterations=0, final_iterations=8), PlanesConfig(enabled=True)
-    mapper = Mapper(source.camera, config, SeedingConfig(), LossConfig(), rng, planes, structure)
+    structure, config = StructureConfig(pgi_interval=1), MappingConfig(iterations=0, final_iterations=8)
+    mapper = Mapper(source.camera, config, PlanesConfig(enabled=True), structure)
     for index in (0, 10):
-        mapper.add_keyframe(keyframe(source, source.read(index)))
+        add(mapper, source, source.read(index))
     first, second = mapper.keyframes
-    shown = first.plane_ids
-    assert shown is not None
+    assert first.labels is not None
+    shown = first.labels.image()
     # As if neither the keyframes' own segments had said anything, nor the Gaussians been born with an identity
-    first.plane_ids = second.plane_ids = np.full_like(shown, -1)
+    for one in (first, second):
+        one.show(np.full_like(shown, -1))
     mapper.gaussians.write("embedding", slice(0, mapper.gaussians.count), np.zeros((mapper.gaussians.count, 3)))
     mapper.finish()
     planar = shown >= 0
-    assert (first.plane_ids[planar] == shown[planar]).mean() > 0.95
-    images = mapper.refiner.rasterizer.forward(mapper.gaussians, first.T_cw, with_embedding=True)
+    assert (first.labels.image()[planar] == shown[planar]).mean() > 0.95
+    images = mapper.refinement.refiner.rasterizer.forward(mapper.gaussians, first.T_cw, with_embedding=True)
     found = read_ids(images.embedding, images.opacity, np.unique(shown[planar]), structure)
     assert (found[planar] == shown[planar]).mean() > 0.8
 
@@ -356,7 +325,7 @@ def test_the_final_pass_leaves_the_mean_brightness_of_the_views(source: Syntheti
     for last in range(0, 5, 2):
         mapper = make_mapper(source)
         for one in np.roll(np.arange(5), 4 - last):
-            mapper.add_keyframe(Keyframe.from_frame(frames[one], np.eye(4), Exposure(), np.eye(6)))
+            mapper.add(frames[one], np.eye(4))
         mapper.finish()
         brightness = view(mapper, np.eye(4)).colour.mean() / np.clip(frame.colour, 0, 0.8).mean()
         assert brightness == pytest.approx(1.0, abs=0.03)
@@ -364,30 +333,29 @@ def test_the_final_pass_leaves_the_mean_brightness_of_the_views(source: Syntheti
 
 def test_pose_refinement_takes_a_disturbed_keyframe_back(source: SyntheticSource) -> None:
     mapper = mapped(source, range(0, 25, 5), refine_poses=False, iterations=30)
-    middle = mapper.keyframes[2]
-    middle.T_cw = se3_exp([0, 0, 0, 0.004, -0.003, 0]) @ middle.T_cw
-    before = flow_px(source, middle), shift_mm(source, middle)
-    others = [(k, k.T_cw.copy()) for k in mapper.keyframes if k is not middle]
+    middle, refiner = mapper.keyframes[2], mapper.refinement.refiner
+    T_cw = se3_exp([0, 0, 0, 0.004, -0.003, 0]) @ middle.T_cw
+    before, adam = (flow_px(source, middle, T_cw), shift_mm(source, middle, T_cw)), VectorAdam([0.0003] * 6)
     for step in range(75):
-        current = mapper.keyframes[step % 5]
-        mapper.refiner.step(mapper.gaussians, current, move_pose=current is middle)
-    after = flow_px(source, middle), shift_mm(source, middle)
+        if step % 5 == 2:
+            T_cw = se3_exp(adam.step(refiner.step(middle, T_cw).g_pose)) @ T_cw
+        else:
+            refiner.step(mapper.keyframes[step % 5])
+    after = flow_px(source, middle, T_cw), shift_mm(source, middle, T_cw)
     assert after[0] < 0.3 * before[0]
     assert after[1] < 0.8 * before[1]
-    assert all((k.T_cw == T_cw).all() for k, T_cw in others)
 
 
-def shift_mm(source: SyntheticSource, frame: Keyframe) -> float:
-    return 1000 * float(np.linalg.norm(se3_log(frame.T_cw @ inverse(true_T_cw(source, frame.index)))[3:]))
+def shift_mm(source: SyntheticSource, frame: Keyframe, T_cw: NDArray) -> float:
+    return 1000 * float(np.linalg.norm(se3_log(T_cw @ inverse(true_T_cw(source, frame.index)))[3:]))
 
 
-def flow_px(source: SyntheticSource, frame: Keyframe) -> float:
+def flow_px(source: SyntheticSource, frame: Keyframe, T_cw: NDArray) -> float:
     """How far the keyframe's pose error moves what it sees in its image: median over pixels."""
     camera, depth_m = source.camera, source.clean(frame.index).depth_m
     v, u = np.indices(depth_m.shape)
-    x = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(depth_m)], -1)
-    x *= depth_m[..., None]
-    moved = transform_points(frame.T_cw @ inverse(true_T_cw(source, frame.index)), x)
+    x = camera.points_at(u, v, depth_m)
+    moved = transform_points(T_cw @ inverse(true_T_cw(source, frame.index)), x)
     return float(np.median(np.linalg.norm(camera.fx * (moved / moved[..., 2:] - x / x[..., 2:]), axis=-1)))
 
 
@@ -395,7 +363,7 @@ def test_only_keyframes_of_the_window_move_and_never_the_first(source: Synthetic
     mapper = make_mapper(source, window=2, anchors="random", anchor_count=2, iterations=8, refine_poses=True)
     poses: list[list[NDArray]] = []
     for index in range(0, 20, 5):
-        mapper.add_keyframe(keyframe(source, source.read(index)))
+        add(mapper, source, source.read(index))
         poses.append([k.T_cw.copy() for k in mapper.keyframes])
     assert (poses[-1][0] == poses[0][0]).all()
     assert (poses[-1][1] == poses[-2][1]).all()  # has left the window
@@ -408,34 +376,22 @@ def test_poses_stay_when_they_are_not_to_be_refined(source: SyntheticSource) -> 
     assert all((k.T_cw == true_T_cw(source, k.index)).all() for k in mapper.keyframes)
 
 
-def test_rows_stay_in_step_with_the_map_through_a_run(source: SyntheticSource) -> None:
-    mapper = make_mapper(source, iterations=3, prune_weight_px=1.0)
-    lost = 0
-    for index in range(0, 50, 10):
-        before = mapper.gaussians.count
-        mapper.add_keyframe(keyframe(source, source.read(index)))
-        born = (mapper.gaussians.host("birth_keyframe") == len(mapper.keyframes) - 1).sum()
-        lost += before + born - mapper.gaussians.count
-        assert_rows_agree(mapper)
-    assert lost > 50  # so that rows have moved
-
-
 # Exposure and storage
 
 
 def test_a_dark_keyframe_is_mapped_at_the_maps_brightness(source: SyntheticSource) -> None:
     mapper = make_mapper(source)
     frame = source.read(0)
-    mapper.add_keyframe(keyframe(source, replace(frame, colour=0.5 * frame.colour), gain=2.0))
+    add(mapper, source, replace(frame, colour=0.5 * frame.colour), gain=2.0)
     rendering = view(mapper, np.eye(4))
     assert rendering.colour.mean() == pytest.approx(frame.colour.mean(), rel=0.02)
     assert psnr(rendering.colour, frame.colour) > 28.0
 
 
-def test_keyframes_keep_their_images_in_five_bytes_a_pixel(source: SyntheticSource) -> None:
+def test_keyframes_keep_their_images_in_five_bytes_a_pixel_and_their_planes_in_one() -> None:
     colour = (np.arange(256 * 3, dtype=np.float32) / (256 * 3 - 1)).reshape(16, 16, 3)
     depth_m = np.linspace(0.0, 13.5, 256, dtype=np.float32).reshape(16, 16)
-    kept = Keyframe.from_frame(Frame(3, 0.25, colour, depth_m), np.eye(4), Exposure(1.5, 0.1), np.eye(6))
+    kept = Keyframe(Frame(3, 0.25, colour, depth_m), np.eye(4), Exposure(1.5, 0.1), np.eye(6))
     assert np.abs(kept.colour() - colour).max() <= 0.5 / 255 + 1e-6
     far = depth_m > 13.107
     assert np.abs(kept.depth_m() - depth_m)[~far].max() <= 0.0001 + 1e-6
@@ -445,7 +401,9 @@ def test_keyframes_keep_their_images_in_five_bytes_a_pixel(source: SyntheticSour
     assert kept.colour().dtype == kept.depth_m().dtype == np.float32
     stored = [value for value in vars(kept).values() if isinstance(value, np.ndarray) and value.size >= 256]
     assert sum(array.nbytes for array in stored) == 5 * 256
-    again = Keyframe.from_frame(Frame(3, 0.25, kept.colour(), kept.depth_m()), np.eye(4), Exposure(), np.eye(6))
+    kept.show(np.where(far, 70_000, -1))
+    assert kept.labels is not None and kept.labels.places.nbytes == 256
+    again = Keyframe(Frame(3, 0.25, kept.colour(), kept.depth_m()), np.eye(4), Exposure(), np.eye(6))
     np.testing.assert_array_equal(again.colour(), kept.colour())
     np.testing.assert_array_equal(again.depth_m(), kept.depth_m())
 
@@ -471,7 +429,7 @@ def test_the_map_follows_its_keyframes(seed: int) -> None:
     source = SyntheticSource(SyntheticConfig(scene="room", width=160, height=120, frames=720), seed=seed)
     mapper = make_mapper(source, window=3, iterations=9)
     for index in range(0, 40, 8):
-        mapper.add_keyframe(keyframe(source, source.read(index)))
+        add(mapper, source, source.read(index))
     old = mapper.keyframes[:4]
     before = [view(mapper, k.T_cw) for k in old]
     off_m = [own_depth_off_m(mapper, k) for k in old]
@@ -487,23 +445,22 @@ def test_the_map_follows_its_keyframes(seed: int) -> None:
     np.testing.assert_allclose(old[0].T_cw, poses[0], atol=1e-9)
     moved = inverse(mapper.keyframes[-1].T_cw) @ poses[-1]
     np.testing.assert_allclose(moved, corrections(5)[4], atol=0.005)  # refinement moves the window a little
-    assert_rows_agree(mapper)
 
 
 def test_gaussians_move_by_what_each_keyframe_has_said_of_their_depth(source: SyntheticSource) -> None:
     """What the second keyframe has not measured stays with the first one, the rest moves by its share of what is known,
     in eighths."""
     mapper, frame = make_mapper(source, iterations=0), source.read(0)
-    mapper.add_keyframe(keyframe(source, frame))
-    alone, count = mapper.information.copy(), mapper.gaussians.count
+    add(mapper, source, frame)
+    alone, count = mapper.known("information"), mapper.gaussians.count
     numbered = np.zeros((count, 3), np.float32)
     numbered[:, 0] = np.arange(count)
     mapper.gaussians.write("embedding", slice(0, count), numbered)  # some will go
     hidden = replace(frame, index=1, depth_m=frame.depth_m.copy())
     hidden.depth_m[PATCH] = 0.0
-    mapper.add_keyframe(keyframe(source, hidden, np.eye(4)))
-    rows = np.flatnonzero((mapper.gaussians.host("birth_keyframe") == 0) & (mapper.information > 0))
-    share = 1.0 - alone[mapper.gaussians.host("embedding")[rows, 0].astype(int)] / mapper.information[rows]
+    add(mapper, source, hidden, np.eye(4))
+    rows = np.flatnonzero((mapper.gaussians.host("birth_keyframe") == 0) & (mapper.known("information") > 0))
+    share = 1.0 - alone[mapper.gaussians.host("embedding")[rows, 0].astype(int)] / mapper.known("information")[rows]
     before = mapper.gaussians.host("mean")[rows]
     mapper.follow({1: se3_exp([0.0, 0.0, 0.0, 0.008, 0.0, 0.0])})
     moved_m = mapper.gaussians.host("mean")[rows] - before
@@ -520,11 +477,10 @@ def test_a_loop_that_closes_tears_no_view() -> None:
     nearly, before anything is refined."""
     walk = SyntheticSource(SyntheticConfig(scene="loop", width=160, height=120, frames=720), seed=0)
     mapper = mapped(walk, range(0, 240, 12), iterations=6)
-    mapper.config = replace(mapper.config, iterations=0)
     off_m = [own_depth_off_m(mapper, k) for k in mapper.keyframes]
     quality = [psnr(view(mapper, k.T_cw).colour, k.colour()) for k in mapper.keyframes]
     drift = np.array([0.07, -0.09, 0.04, 0.75, -0.5, 0.45]) * 0.03
-    mapper.follow({k: se3_exp(drift * k / 19) for k in range(20)})
+    mapper.map.move({k: se3_exp(drift * k / 19) for k in range(20)})
     for keyframe_, off, was in zip(mapper.keyframes, off_m, quality, strict=True):
         assert own_depth_off_m(mapper, keyframe_) < off + 0.001
         assert psnr(view(mapper, keyframe_.T_cw).colour, keyframe_.colour()) > was - 0.6
@@ -533,13 +489,13 @@ def test_a_loop_that_closes_tears_no_view() -> None:
 def test_a_common_motion_of_all_keyframes_changes_no_view_and_refines_nothing(source: SyntheticSource) -> None:
     mapper = mapped(source, range(0, 24, 8))
     before = [view(mapper, k.T_cw).colour for k in mapper.keyframes]
-    views = mapper.refiner.views.copy()
+    views = mapper.known("views")
     mapper.follow(dict.fromkeys(range(3), se3_exp([0.1, -0.2, 0.3, 1.0, 0.5, -2.0])))
     for was, k in zip(before, mapper.keyframes, strict=True):
         change = np.abs(view(mapper, k.T_cw).colour - was)
         # by rounding, a splat at the threshold of what is drawn may come or go
         assert change.max() < ALPHA_MIN and np.quantile(change, 0.999) < 1e-4
-    np.testing.assert_array_equal(mapper.refiner.views, views)
+    np.testing.assert_array_equal(mapper.known("views"), views)
 
 
 def test_the_size_in_the_image_is_that_of_the_longest_axis(source: SyntheticSource) -> None:

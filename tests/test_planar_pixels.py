@@ -3,7 +3,7 @@
 import numpy as np
 
 from tgslam.camera import Camera
-from tgslam.mapping.planar import PlanarPixels
+from tgslam.mapping.planar_pixels import PlanarPixels
 
 CAMERA = Camera(64, 48, 100.0, 100.0, 31.5, 23.5)
 HOLE = np.s_[10:20, 30:40]

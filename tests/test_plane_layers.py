@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
 from tests.plane_views import DEPTH_SIGMA_PER_M2, Rectangle, cast, looking, points_c, segment_of
-from tgslam.camera import Camera
+from tgslam.camera import Camera, SensorNoise
 from tgslam.config.plane_settings import PlanesConfig
 from tgslam.device import runtime
-from tgslam.mapping.planar import PlanarMapping
+from tgslam.map.keyframes import Keyframe
+from tgslam.map.world import Map
+from tgslam.mapping.plane_observation import PlaneObserver
 from tgslam.ops.plane_fit import CellGrid
 from tgslam.planes.instances.registry import PlaneRegistry
 from tgslam.planes.segment import PlaneView
@@ -20,6 +22,7 @@ from tgslam.planes.segmentation.cells import planar_cells
 from tgslam.planes.segmentation.extraction import extract_planes
 from tgslam.planes.segmentation.layers import bordering, part_layers, settle
 from tgslam.planes.segmentation.merging import Agreement
+from tgslam.types import Exposure, Frame
 
 CAMERA = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
 CONFIG = PlanesConfig()
@@ -251,51 +254,74 @@ def test_a_view_that_tells_the_board_itself_is_left_as_it_is() -> None:
     assert told_of_a_board().with_known_steps(alone, depth_m, CAMERA, ALONG[3]) is alone
 
 
+class Observed:
+    """Keyframes of which only the planes are looked at."""
+
+    def __init__(self) -> None:
+        config = replace(CONFIG, enabled=True)
+        self.map = Map(CAMERA, SensorNoise(DEPTH_SIGMA_PER_M2), config)
+        self.observer = PlaneObserver(CAMERA, config, self.map.noise)
+
+    def observe(self, T_cw: np.ndarray, depth_m: np.ndarray) -> None:
+        frame = Frame(len(self.map.keyframes), 0.0, np.zeros((*depth_m.shape, 3), np.float32), depth_m)
+        self.map.keyframes.add(Keyframe(frame, T_cw, Exposure(), np.eye(6)))
+        self.observer.observe(self.map)
+
+    def shown(self, number: int) -> np.ndarray:
+        """[H, W] the PGI of each pixel of a keyframe."""
+        labels = self.map.keyframes[number].labels
+        assert labels is not None
+        return labels.image()
+
+    @property
+    def instances(self) -> dict:
+        assert self.map.planes is not None
+        return self.map.planes.instances
+
+
 def test_keyframes_before_a_plane_was_confirmed_show_it_too() -> None:
-    mapping, keyframes = PlanarMapping(CAMERA, CONFIG, DEPTH_SIGMA_PER_M2), []
-    masks = []
+    world, masks = Observed(), []
     for index, T_cw in enumerate(ALONG):
         depth_m, labels = measured([WALL, BOARD], T_cw, index)
-        keyframes.append(SimpleNamespace(T_cw=T_cw, depth_m=lambda depth_m=depth_m: depth_m, plane_ids=None))
         masks.append(labels == 1)
-        mapping.observe(keyframes)
-    latest = keyframes[-1].plane_ids[masks[-1]]
+        world.observe(T_cw, depth_m)
+    latest = world.shown(-1)[masks[-1]]
     board = int(np.bincount(latest[latest >= 0]).argmax())
-    assert min(mapping.instances[board].keyframes) == 0
-    assert np.mean(keyframes[0].plane_ids[masks[0]] == board) > 0.6
+    assert min(world.instances[board].keyframes) == 0
+    assert np.mean(world.shown(0)[masks[0]] == board) > 0.6
 
 
 def test_a_surface_that_waits_for_other_views_is_no_part_of_the_floor_that_it_stands_on() -> None:
     floor = Rectangle((0.0, 0.0, 0.56), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (6.0, 4.0))
-    mapping, keyframes = PlanarMapping(CAMERA, CONFIG, DEPTH_SIGMA_PER_M2), []
+    world = Observed()
     for index, T_cw in enumerate(ALONG[:2]):
         depth_m, labels = measured([WALL, BOARD, floor], T_cw, index)
-        keyframes.append(SimpleNamespace(T_cw=T_cw, depth_m=lambda depth_m=depth_m: depth_m, plane_ids=None))
-        mapping.observe(keyframes)
+        world.observe(T_cw, depth_m)
         view = seen(depth_m)
         waiting = view.labels == of_board(view, labels)
         assert waiting.sum() > 500
-        assert (keyframes[-1].plane_ids[waiting] == -1).all()
+        assert (world.shown(-1)[waiting] == -1).all()
 
 
 def test_keyframes_show_in_the_end_what_only_later_ones_have_seen_of_a_plane() -> None:
-    mapping, keyframes = PlanarMapping(CAMERA, CONFIG, DEPTH_SIGMA_PER_M2), []
+    world = Observed()
     speck = np.zeros((CAMERA.height, CAMERA.width), bool)
     speck[110:122, 240:252] = True
     for index, T_cw in enumerate(ALONG[:3]):
         depth_m, _ = measured([WALL], T_cw, index)
         if index == 0:  # nothing of the right half but a speck, which is less than a segment
             depth_m[:, 150:][~speck[:, 150:]] = 0.0
-        keyframes.append(SimpleNamespace(T_cw=T_cw, depth_m=lambda depth_m=depth_m: depth_m, plane_ids=None))
-        mapping.observe(keyframes)
-    (wall,) = mapping.instances
-    first, later = keyframes[0].plane_ids, keyframes[1].plane_ids
+        world.observe(T_cw, depth_m)
+    (wall,) = world.instances
+    first, keyframes = world.shown(0), world.map.keyframes
+    versions = [keyframe.label_version for keyframe in keyframes]
     assert (first[speck] == -1).all()
-    mapping.complete(keyframes)
-    assert np.mean(keyframes[0].plane_ids[speck] == wall) > 0.9
+    world.observer.complete(world.map)
+    assert np.mean(world.shown(0)[speck] == wall) > 0.9
     known = (first >= 0) | (keyframes[0].depth_m() == 0)
-    np.testing.assert_array_equal(keyframes[0].plane_ids[known], first[known])
-    assert keyframes[1].plane_ids is later  # nothing to tell
+    np.testing.assert_array_equal(world.shown(0)[known], first[known])
+    assert keyframes[0].label_version > versions[0]
+    assert keyframes[1].label_version == versions[1]  # nothing to tell
 
 
 def test_bordering_labels_are_listed_in_both_orders() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tgslam.camera import Camera
-from tgslam.config.map_settings import StructureConfig
+from tgslam.config.plane_settings import StructureConfig
 from tgslam.planes.identity.outline import Outline
 from tgslam.planes.identity.reading import PlaneReader
 from tgslam.types import Plane

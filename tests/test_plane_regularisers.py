@@ -7,7 +7,7 @@ import pytest
 
 from tests.reference import plane_regularisers as reference
 from tests.test_loss_kernels import assert_gradient, central
-from tgslam.config.map_settings import StructureConfig
+from tgslam.config.plane_settings import StructureConfig
 from tgslam.device import runtime
 from tgslam.geometry import matrix_from_quat_wxyz
 from tgslam.map.gaussians import GaussianMap

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from tests.reference import rigid as reference
 from tgslam.camera import Camera
 from tgslam.device import runtime
-from tgslam.geometry import inverse, quat_wxyz_from_matrices, se3_exp
-from tgslam.kernels import rigid
+from tgslam.geometry import inverse, se3_exp
 from tgslam.map.gaussians import GaussianMap
+from tgslam.ops import rigid
 from tgslam.ops.rasterize import Rasterizer
 from tgslam.types import Gaussians
 
@@ -36,10 +36,7 @@ def gaussians(count: int, births: int, seed: int = 0) -> Gaussians:
 def moved(carriers: np.ndarray, motions: np.ndarray, given_rows: Gaussians, rows: int) -> tuple[np.ndarray, np.ndarray]:
     """Centres and quaternions of all rows, after the kernel has moved the first ones."""
     mean, quat = runtime.to_device(given_rows.mean.copy()), runtime.to_device(given_rows.quat_wxyz.copy())
-    rigid.move_rows(
-        rows, runtime.to_device(carriers, np.int32), runtime.to_device(quat_wxyz_from_matrices(motions[:, :3, :3])),
-        runtime.to_device(motions[:, :3].reshape(-1, 12)), mean, quat,
-    )  # fmt: skip
+    rigid.move_rows(motions, runtime.to_device(carriers, np.int32), mean, quat, rows)
     return runtime.to_host(mean), runtime.to_host(quat)
 
 
@@ -71,7 +68,7 @@ def test_a_map_and_a_camera_that_move_together_see_the_same(xi: list[float]) -> 
     motion, rasterizer = se3_exp(xi), Rasterizer(CAMERA)
     still = GaussianMap.from_gaussians(gaussians(80, 1))
     before = rasterizer.render(still, np.eye(4))
-    still.move(motion[None], np.zeros((80, 1), np.int32))
+    still.move(motion[None])
     after = rasterizer.render(still, inverse(motion))
     np.testing.assert_allclose(after.colour, before.colour, atol=2e-4)
     np.testing.assert_allclose(after.opacity, before.opacity, atol=2e-4)
@@ -82,7 +79,7 @@ def test_each_row_follows_its_own_keyframe() -> None:
     before = moving.gaussians()
     lift = np.stack([np.eye(4), np.eye(4)])
     lift[1, 1, 3] = 0.5
-    moving.move(lift, before.birth_keyframe[:, None])
+    moving.move(lift)
     after = moving.gaussians()
     shift = after.mean - before.mean
     np.testing.assert_allclose(shift[:, 1], 0.5 * before.birth_keyframe, atol=1e-6)

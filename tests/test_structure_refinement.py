@@ -7,16 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tgslam.camera import SensorNoise
 from tgslam.config.input_settings import SyntheticConfig
-from tgslam.config.map_settings import LossConfig, MappingConfig, SeedingConfig, StructureConfig
-from tgslam.config.plane_settings import PlanesConfig
+from tgslam.config.map_settings import LossConfig, MappingConfig, SeedingConfig
+from tgslam.config.plane_settings import PlanesConfig, StructureConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.device import runtime
 from tgslam.geometry import inverse
 from tgslam.map.gaussians import PARAMETERS, GaussianMap
-from tgslam.map.keyframe import Keyframe
+from tgslam.map.keyframes import Keyframe
 from tgslam.mapping.insertion import quadtree, seed
 from tgslam.mapping.refinement import Refiner
+from tgslam.mapping.structure_terms import StructureTerms
 from tgslam.planes.identity import palette
 from tgslam.planes.identity.codes import codes_of, initial_theta, read_ids
 from tgslam.planes.instances.plane_table import PlaneTable
@@ -34,11 +36,9 @@ def source() -> SyntheticSource:
 
 def true_keyframe(source: SyntheticSource, index: int, *, with_planes: bool = True) -> Keyframe:
     """In the frame of the first camera, with true labels."""
-    result = Keyframe.from_frame(
-        source.read(index), inverse(source.pose(index)) @ source.pose(0), Exposure(), np.eye(6)
-    )
+    result = Keyframe(source.read(index), inverse(source.pose(index)) @ source.pose(0), Exposure(), np.eye(6))
     if with_planes:
-        result.plane_ids = source.labels(index).astype(np.int16)
+        result.show(source.labels(index))
     return result
 
 
@@ -52,7 +52,7 @@ def true_planes(source: SyntheticSource) -> PlaneTable:
 def seeded(source: SyntheticSource) -> GaussianMap:
     """The first view's surface; the plane of each Gaussian is known, its embedding is neutral."""
     frame, view = source.read(0), true_keyframe(source, 0)
-    cells = quadtree(frame.colour, frame.depth_m, frame.depth_m > 0, SeedingConfig(), LossConfig().depth_sigma_per_m2)
+    cells = quadtree(frame.colour, frame.depth_m, frame.depth_m > 0, SeedingConfig(), LossConfig().noise)
     gaussians = seed(cells, np.zeros((120, 160, 3)), source.camera, view.T_cw, 0, SeedingConfig())
     ids = source.labels(0)[np.rint(cells.v).astype(int), np.rint(cells.u).astype(int)]
     return GaussianMap.from_gaussians(replace(gaussians, plane_id=ids))
@@ -60,8 +60,9 @@ def seeded(source: SyntheticSource) -> GaussianMap:
 
 def change_ids(view: Keyframe) -> None:
     """A plane turns out to be none."""
-    assert view.plane_ids is not None
-    view.plane_ids = np.where(view.plane_ids == 0, np.int16(-1), view.plane_ids)
+    assert view.labels is not None
+    shown = view.labels.image()
+    view.show(np.where(shown == 0, -1, shown))
 
 
 def refined(
@@ -69,13 +70,12 @@ def refined(
 ) -> tuple[GaussianMap, Refiner]:
     """Steps on two views in turn."""
     gaussians = seeded(source)
-    refiner = Refiner(source.camera, MappingConfig(), LossConfig(), structure=config)
-    if with_planes:
-        refiner.set_planes(true_planes(source))
-    refiner.append(gaussians.count)
+    refiner = Refiner(gaussians, source.camera, MappingConfig(), LossConfig(), config)
+    if with_planes and refiner.structure:
+        refiner.structure.know(true_planes(source), 1)
     views = [true_keyframe(source, index, with_planes=with_planes) for index in VIEWS]
     for step in range(steps):
-        refiner.step(gaussians, views[step % len(views)], move_pose=True)
+        refiner.step(views[step % len(views)])
     return gaussians, refiner
 
 
@@ -119,20 +119,15 @@ def test_gaussians_go_to_their_planes(source: SyntheticSource) -> None:
 
 
 def test_embeddings_take_part_in_every_nth_step_of_a_keyframe(source: SyntheticSource) -> None:
-    refiner = Refiner(source.camera, MappingConfig(), LossConfig(), structure=replace(CONFIG, pgi_interval=3))
-    terms = refiner.structure
-    assert terms is not None
+    terms = StructureTerms(source.camera, replace(CONFIG, pgi_interval=3), 8)
     first, second = (true_keyframe(source, index) for index in VIEWS)
     assert [terms.due(first) is not None for _ in range(7)] == [True, False, False, True, False, False, True]
     assert terms.due(second) is not None
-    first.plane_ids = None
-    assert terms.due(first) is None
+    assert terms.due(true_keyframe(source, 0, with_planes=False)) is None
 
 
 def test_a_keyframe_with_new_ids_is_prepared_anew(source: SyntheticSource) -> None:
-    refiner = Refiner(source.camera, MappingConfig(), LossConfig(), structure=replace(CONFIG, pgi_interval=1))
-    terms, view = refiner.structure, true_keyframe(source, 0)
-    assert terms is not None
+    terms, view = StructureTerms(source.camera, replace(CONFIG, pgi_interval=1), 8), true_keyframe(source, 0)
     before, again = terms.due(view), terms.due(view)
     assert before is again
     change_ids(view)
@@ -140,14 +135,17 @@ def test_a_keyframe_with_new_ids_is_prepared_anew(source: SyntheticSource) -> No
 
 
 def test_a_keyframe_with_new_ids_takes_part_in_its_next_refinement(source: SyntheticSource) -> None:
-    refiner = Refiner(source.camera, MappingConfig(), LossConfig(), structure=replace(CONFIG, pgi_interval=3))
-    terms, view, other = refiner.structure, true_keyframe(source, 0), true_keyframe(source, VIEWS[1])
-    assert terms is not None
+    terms, view, other = (
+        StructureTerms(source.camera, replace(CONFIG, pgi_interval=3), 8),
+        true_keyframe(source, 0),
+        true_keyframe(source, VIEWS[1]),
+    )
     assert [terms.due(v) is not None for v in (view, other, view, other)] == [True, True, False, False]
     change_ids(view)
     target = terms.due(view)
     assert target is not None
-    np.testing.assert_array_equal(runtime.to_host(target.ids), view.plane_ids)
+    assert view.labels is not None
+    np.testing.assert_array_equal(runtime.to_host(target.ids), view.labels.image())
     assert [terms.due(view) is not None for _ in range(3)] == [False, False, True]  # counted from there
     assert [terms.due(other) is not None for _ in range(2)] == [False, True]  # the others keep their turn
 
@@ -158,10 +156,10 @@ def taken_over(source: SyntheticSource, config: StructureConfig, plane: int) -> 
     gaussians.write("embedding", slice(0, gaussians.count), initial_theta(gaussians.host("plane_id"), config))
     frame, labels = source.read(0), source.labels(0)
     around = replace(frame, index=1, depth_m=np.where(labels == plane, np.float32(0.0), frame.depth_m))
-    blind = Keyframe.from_frame(around, np.eye(4), Exposure(), np.eye(6))
-    blind.plane_ids = np.where(labels == plane, -1, labels).astype(np.int16)
+    blind = Keyframe(around, np.eye(4), Exposure(), np.eye(6))
+    blind.show(np.where(labels == plane, -1, labels))
     for view in (true_keyframe(source, 0), blind, blind):
-        refiner.step(gaussians, view, move_pose=False)
+        refiner.step(view)
     colours = 1.0 / (1.0 + np.exp(-gaussians.host("embedding")[gaussians.host("plane_id") == plane]))
     return float(np.mean(palette.ids_of(colours, np.unique(labels[labels >= 0]), CONFIG.read_margin) != plane))
 
@@ -183,16 +181,15 @@ def test_absorbed_planes_look_like_their_survivors_and_removed_ones_like_none(so
     table = true_planes(source)
     table.ids[2], table.ids[3] = 1, -1
     table.planes_w[2], table.planes_w[3] = table.planes_w[1], 0.0
-    refiner = Refiner(source.camera, MappingConfig(), LossConfig(), structure=CONFIG)
-    assert refiner.structure is not None
-    refiner.set_planes(table)
-    codes = np.asarray(refiner.structure.codes)
+    terms = StructureTerms(source.camera, CONFIG, 8)
+    terms.know(table, 1)
+    codes = np.asarray(terms.codes)
     np.testing.assert_array_equal(codes[3], codes[2])
     np.testing.assert_array_equal(codes[4], codes[0])
     np.testing.assert_array_equal(codes[2], codes_of(1, CONFIG))
 
 
 def test_the_table_of_a_registry_without_planes_is_empty_of_them() -> None:
-    table = PlaneTable.of(PlaneRegistry(PlanesConfig(), 0.0015), 3)
+    table = PlaneTable.of(PlaneRegistry(PlanesConfig(), SensorNoise(0.0015), {}), 3)
     np.testing.assert_array_equal(table.ids, [-1, -1, -1])
     assert not table.planes_w.any()

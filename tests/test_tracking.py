@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import ndtr
 
+from tests.mapper import Mapper
 from tests.reference import alignment as reference
 from tgslam.camera import Camera
 from tgslam.config.input_settings import SyntheticConfig
@@ -22,8 +23,6 @@ from tgslam.device import runtime
 from tgslam.geometry import inverse, se3_exp, se3_log
 from tgslam.kernels import alignment
 from tgslam.map.gaussians import GaussianMap
-from tgslam.map.keyframe import Keyframe
-from tgslam.mapping.mapper import Mapper
 from tgslam.ops.rasterize import RenderImages
 from tgslam.tracking.exposure import IntensityMoments, fit_exposure
 from tgslam.tracking.first_order import FirstOrderTracker
@@ -51,9 +50,8 @@ def map_of(scene: str, index: int, noise: bool = False) -> GaussianMap:
     """A map of one frame, refined until the error of tracking against it is tracking's own."""
     config, one = Config(), source(scene, noise)
     mapping = replace(config.mapping, iterations=60)
-    mapper = Mapper(one.camera, mapping, config.seeding, config.loss, np.random.default_rng(0))
-    T_cw = inverse(one.pose(index))
-    mapper.add_keyframe(Keyframe.from_frame(one.read(index), T_cw, Exposure(), np.eye(6)))
+    mapper = Mapper(one.camera, mapping, loss=config.loss, seeding=config.seeding)
+    mapper.add(one.read(index), inverse(one.pose(index)))
     return mapper.gaussians
 
 

@@ -86,7 +86,7 @@ class Camera:
         z = np.maximum(points_c[..., 2], _NEAREST_M)
         return self.fx * points_c[..., 0] / z + self.cx, self.fy * points_c[..., 1] / z + self.cy
 
-    def holds(self, u: NDArray[np.floating], v: NDArray[np.floating]) -> NDArray[np.bool_]:
+    def holds(self, u: NDArray[Any], v: NDArray[Any]) -> NDArray[np.bool_]:
         """Which places u, v [...] px, in whole pixels, are in the image."""
         inside: NDArray[np.bool_] = (u >= 0) & (v >= 0) & (u < self.width) & (v < self.height)
         return inside

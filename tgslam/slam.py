@@ -1,262 +1,130 @@
-"""The system on one screen: track each frame against the map, choose keyframes, grow and refine the map (Fig. 2)."""
+"""The system on one screen, as the paper's Fig. 2: track, ask for a keyframe, see its planes, grow, refine, close."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
-
 import numpy as np
-from numpy.typing import NDArray
 
+from tgslam import assembly
 from tgslam.camera import Camera
 from tgslam.config.schema import Config
-from tgslam.device import runtime
-from tgslam.errors import ConfigError, FrameError, GraphError
-from tgslam.geometry import inverse, orthonormalized
-from tgslam.keyframing.covisibility import KeyframeSelector
-from tgslam.keyframing.structure_cue import StructureCue
-from tgslam.map.keyframe import Keyframe
-from tgslam.mapping.brightness import relative_gain
-from tgslam.mapping.mapper import Mapper
-from tgslam.ops.depth import measured_share, without_flying_pixels, without_range_limit
-from tgslam.tracking.motion import MotionFilter
-from tgslam.tracking.reference import NO_PLANES, Reference, references_of
+from tgslam.errors import GraphError
+from tgslam.keyframing.cues import Cues
+from tgslam.map.frame_poses import FramePoses
+from tgslam.map.world import Map
+from tgslam.mapping.growth import Growth
+from tgslam.mapping.window import WindowRefinement
+from tgslam.preparation import Preparation
+from tgslam.record import FrameRecord
+from tgslam.tracking.front_end import FrontEnd
 from tgslam.tracking.result import TrackingResult
-from tgslam.tracking.solver import make_tracker, track_or_recover
 from tgslam.types import Exposure, Frame, FrameReport, FrameStatus, Gaussians, Plane, Trajectory
-
-if TYPE_CHECKING:
-    from tgslam.graph.closing import GraphClosing
-
-_MIN_DEPTH_SHARE = 0.01  # a frame with depth in fewer of its pixels is not usable
-_FALLBACKS = 3  # latest keyframes from which a lost camera is sought
-
-
-@dataclass(frozen=True)
-class _Posed:
-    """A frame's pose relative to its keyframe, so that refining the keyframe moves the frame with it."""
-
-    timestamp_s: float
-    keyframe: Keyframe
-    T_ck: NDArray[np.float64]  # [4, 4] keyframe's camera to the frame's
 
 
 class Slam:
-    """RGB-D frames in; poses and a Gaussian map out. The first frame's camera is the world frame."""
+    """RGB-D frames in; poses, a Gaussian map and persistent planes out. The first frame's camera is the world frame."""
 
     def __init__(self, camera: Camera, config: Config) -> None:
-        self.camera, self.sigma_per_m2 = camera, config.loss.depth_sigma_per_m2
-        self._reference_count = config.tracking.references
-        self._matches_brightness = config.tracking.exposure == "gain"
-        self.tracker = make_tracker(camera, config.tracking, config.loss)
-        self.motion = MotionFilter(config.tracking)
-        self.selector = KeyframeSelector(config.keyframes)
-        rng = np.random.default_rng(config.seed)
-        self.mapper = Mapper(
-            camera, config.mapping, config.seeding, config.loss, rng, config.planes, config.structure
-        )  # fmt: skip
-        self.structure_cue = StructureCue(config.planes)
-        self.closing = _closing(camera, config)
-        self.exposure = Exposure()
-        self._posed: list[_Posed] = []
-        self._stage_s: dict[str, float] = {}
-        self._remarks: list[str] = []  # on the present frame
-        self._untied: list[tuple[int, int]] = []  # keyframes between which closures have moved nothing yet
+        noise, rng = config.loss.noise, np.random.default_rng(config.seed)
+        structure = config.structure if config.planes.enabled else None
+        self.camera, self.map = camera, Map(camera, noise, config.planes)
+        self.front_end = FrontEnd(camera, config.tracking, config.loss)
+        self._prepare, self._cues = Preparation(camera, noise), Cues(config.keyframes, config.planes)
+        self._planes, self._closing = assembly.plane_observer(camera, config), assembly.graph_closing(camera, config)
+        self._refinement = WindowRefinement(self.map, camera, config.mapping, config.loss, rng, structure)
+        self._growth = Growth(camera, config.mapping, config.seeding, noise, rng.spawn(1)[0], structure)
+        self._poses = FramePoses(self.map.keyframes)
 
     def process_frame(self, frame: Frame) -> FrameReport:
         """Estimate the frame's pose and, if it shows something new, map it. Frames come in order of time.
 
         Raises FrameError, with nothing changed, for a frame with next to no depth or of another size than the camera's.
         """
-        self._stage_s, self._remarks = {}, []
-        with self._stage("prepare"):
-            frame = self._prepared(frame)
-        if not self.mapper.keyframes:
-            first = TrackingResult(np.eye(4), Exposure(), np.eye(6), lost=False)
-            self._map(frame, first)
-            return self._report(frame, FrameStatus.INITIAL, "first frame", first)
-        with self._stage("track"):
-            result = self._track(frame)
-        with self._stage("select"):
-            cue = "" if result.lost else self._keyframe_cue(frame, result)
-        if cue:
-            self._map(frame, result)
+        record = FrameRecord(frame)
+        with record.stage("prepare"):
+            frame = self._prepare(frame)
+        if not self.map.keyframes:
+            result = TrackingResult(np.eye(4), Exposure(), np.eye(6), lost=False)
+            status, cue = FrameStatus.INITIAL, "first frame"
         else:
-            self._remember(frame, result.T_cw)
-        self._follow(frame, result)
-        return self._report(frame, FrameStatus.LOST if result.lost else FrameStatus.TRACKED, cue, result)
+            with record.stage("track"):  # section 3.1, Eqs. 10 to 13
+                result = self.front_end.track(frame, self.map, self._poses.latest_T_cw())
+            with record.stage("select"):  # section 3.1, the cues
+                cue = "" if result.lost else self._keyframe_cue(frame, result)
+            status = FrameStatus.LOST if result.lost else FrameStatus.TRACKED
+        if cue:
+            self._map(frame, result, record)
+        else:
+            self._poses.add(frame.timestamp_s, result.T_cw)
+        T_cw = self._poses.latest_T_cw()
+        if status is not FrameStatus.INITIAL:  # of the first pose, nothing was measured
+            self.front_end.follow(frame, result, T_cw)
+        closures = self._closing.closure_count if self._closing else None
+        return record.report(status, cue, result, T_cw, self.map.gaussians.count, closures)
+
+    def _keyframe_cue(self, frame: Frame, result: TrackingResult) -> str:
+        seen = self.front_end.tracked_view(self.map)
+        return self._cues.ask(frame, result.T_cw, seen, result.measures["overlap"])
+
+    def _map(self, frame: Frame, result: TrackingResult, record: FrameRecord) -> None:
+        """The frame becomes a keyframe. Each step needs what those before have done.
+
+        The map is weighed before planes are seen, since planes change nothing that it asks; it grows with the planes'
+        depth and ids, so these come first; Gaussians are tied to planes once they are there; the graph comes last, as
+        its motions carry all of that along.
+        """
+        with record.stage("map"):
+            keyframe = self.front_end.keyframe(frame, result, self.map)
+            surface, owners = self._growth.weigh(self.map)
+            planes = self._planes.observe(self.map) if self._planes else None  # sections 3.2, 3.3, Eqs. 5 to 7
+            self._growth.grow(self.map, surface, planes)  # section 3.4
+            if self._planes and planes:
+                self._planes.label(self.map, planes)  # section 3.3, Eqs. 1 to 3
+            self._refinement.refine()  # section 3.4, Eq. 14
+        self._close(owners, record)  # section 3.3, structure closures
+        self._poses.add(frame.timestamp_s)
+        seen = self.front_end.know(self.map)
+        self._cues.reset(frame, keyframe.T_cw, seen, self.map.planes_seen_from(len(self.map.keyframes) - 1))
+
+    def _close(self, owners: dict[int, float], record: FrameRecord) -> None:
+        """The latest keyframe in the pose graph: where planes and closures correct it, map and motion follow."""
+        if not self._closing:
+            return
+        try:
+            with record.stage("graph"):
+                correction = self._closing.close(self.map, owners)
+        except GraphError as error:  # a map that is not corrected is better than none
+            record.remark(str(error))
+            return
+        if correction.closures:
+            record.remark(f"closures with keyframes {', '.join(map(str, correction.closures))}")
+        if correction.motions:
+            with record.stage("follow"):
+                self.map.move(correction.motions)
+                self._refinement.settle(correction.motions, correction.ties)
+            self.front_end.move(correction.motions[len(self.map.keyframes) - 1])
 
     def finish(self) -> None:
         """The final refinement of the map, after the last frame."""
-        if self.mapper.keyframes:
-            self.mapper.finish()
+        if self._planes and self.map.keyframes:
+            self._planes.complete(self.map)
+        self._refinement.finish()
 
     def trajectory(self) -> Trajectory:
         """Camera-to-world poses of every frame that was given."""
-        poses = [inverse(posed.T_ck @ posed.keyframe.T_cw) for posed in self._posed]
-        return _trajectory([posed.timestamp_s for posed in self._posed], poses)
+        return self._poses.trajectory()
 
     def keyframe_trajectory(self) -> Trajectory:
         """Camera-to-world poses of the keyframes."""
-        keyframes = self.mapper.keyframes
-        return _trajectory([k.timestamp_s for k in keyframes], [inverse(k.T_cw) for k in keyframes])
+        return self.map.keyframes.trajectory()
 
     def keyframe_indices(self) -> list[int]:
         """`Frame.index` of the keyframes."""
-        return [keyframe.index for keyframe in self.mapper.keyframes]
+        return [keyframe.index for keyframe in self.map.keyframes]
 
     def gaussians(self) -> Gaussians:
         """The map, on the host."""
-        return self.mapper.gaussians.gaussians()
+        return self.map.gaussians.gaussians()
 
     def planes(self) -> tuple[Plane, ...]:
         """The persistent planes by id, empty when planes are not looked for."""
-        if not self.mapper.planes:
-            return ()
-        from tgslam.planes.instances.export import (
-            planes_of,  # here, as `Mapper` loads the rest of planes only where they are used
-        )
-
-        return planes_of(self.mapper.planes.registry)
-
-    def _track(self, frame: Frame) -> TrackingResult:
-        predicted, prior = self.motion.predict(frame.timestamp_s), self.motion.information(frame.timestamp_s)
-        latest = self._posed[-1]
-        fallbacks = [
-            latest.T_ck @ latest.keyframe.T_cw,
-            *(k.T_cw for k in self.mapper.keyframes[: -_FALLBACKS - 1 : -1]),
-        ]
-        return track_or_recover(
-            self.tracker, frame, self.mapper.gaussians, predicted, fallbacks, self.exposure, prior
-        )  # fmt: skip
-
-    def _keyframe_cue(self, frame: Frame, result: TrackingResult) -> str:
-        seen = self.tracker.rasterizer.visible(self.mapper.gaussians.count)
-        appearance = self.selector.cue(frame, result.T_cw, seen, 1.0 - result.measures["overlap"])
-        return appearance or self.structure_cue.cue(result.T_cw)
-
-    def _map(self, frame: Frame, result: TrackingResult) -> None:
-        keyframe = Keyframe.from_frame(frame, result.T_cw, result.exposure, result.information)
-        if self._matches_brightness and self.mapper.keyframes:
-            self._match_brightness(keyframe)
-        with self._stage("map"):
-            self.mapper.add_keyframe(keyframe)
-        self._close()
-        self._posed.append(_Posed(frame.timestamp_s, keyframe, np.eye(4)))
-        self.tracker.rasterizer.forward(self.mapper.gaussians, keyframe.T_cw)
-        self.selector.reset(frame, keyframe.T_cw, self.tracker.rasterizer.visible(self.mapper.gaussians.count))
-        planes_w = NO_PLANES
-        if self.mapper.planes:
-            seen = self.mapper.planes.seen_from(len(self.mapper.keyframes) - 1)
-            self.structure_cue.reset(seen, keyframe.T_cw)
-            planes_w = np.array([(*p.normal_w, p.offset_m) for p in seen]).reshape(-1, 4)
-        self.tracker.know(planes_w, self._references())
-
-    def _references(self) -> list[Reference]:
-        keyframes = self.mapper.keyframes
-        depth_m = keyframes[-1].depth_m()
-        median_m = float(np.median(depth_m[depth_m > 0])) if depth_m.any() else 0.0
-        chosen = references_of(np.stack([k.T_cw for k in keyframes]), median_m, self._reference_count)
-        return [self._reference(number, keyframes[number]) for number in chosen]
-
-    def _reference(self, number: int, keyframe: Keyframe) -> Reference:
-        planes_c = self.mapper.planes.steadying(number, keyframe) if self.mapper.planes else NO_PLANES
-        return Reference(keyframe.colour(), keyframe.depth_m(), keyframe.T_cw, keyframe.exposure, planes_c)
-
-    def _match_brightness(self, keyframe: Keyframe) -> None:
-        previous = self.mapper.keyframes[-1]
-        gain = relative_gain(keyframe, previous, self.camera)
-        if gain is not None:
-            keyframe.exposure = Exposure(gain * previous.exposure.gain)
-
-    def _close(self) -> None:
-        """The last keyframe in the pose graph: where planes and closures correct it, map and motion follow."""
-        if not self.closing:
-            return
-        latest = len(self.mapper.keyframes) - 1
-        planes = self.mapper.planes.registry if self.mapper.planes else None
-        try:
-            with self._stage("graph"):
-                correction = self.closing.add(self.mapper.keyframes, planes)
-        except GraphError as error:  # a map that is not corrected is better than none
-            self._remarks.append(str(error))
-            return
-        if correction.closures:
-            self._remarks.append(f"closures with keyframes {', '.join(map(str, correction.closures))}")
-        self._untied += [(earlier, latest) for earlier in correction.closures]
-        if correction.motions:
-            self._tie()
-            with self._stage("follow"):
-                self.mapper.follow(correction.motions)
-            self.motion.move(correction.motions[latest])
-
-    def _tie(self) -> None:
-        """Keyframes that closures tie are refined together once the map follows the graph: it may tear between them.
-
-        Before, closures have said nothing that the map does not, and leave it as it would be without them.
-        """
-        for first, second in self._untied:
-            self.mapper.viewpoints.link(first, second)
-        self._untied = []
-
-    def _remember(self, frame: Frame, T_cw: NDArray[np.float64]) -> None:
-        keyframe = self.mapper.keyframes[-1]
-        self._posed.append(_Posed(frame.timestamp_s, keyframe, orthonormalized(T_cw @ inverse(keyframe.T_cw))))
-
-    def _follow(self, frame: Frame, result: TrackingResult) -> None:
-        """The motion model follows the pose as mapping has left it; a lost camera is believed to slow down."""
-        latest = self._posed[-1]
-        T_cw = latest.T_ck @ latest.keyframe.T_cw
-        if result.lost:
-            self.motion.coast(frame.timestamp_s, T_cw)
-        else:
-            self.motion.update(frame.timestamp_s, T_cw, result.information)
-            self.exposure = result.exposure
-
-    def _prepared(self, frame: Frame) -> Frame:
-        """The frame without flying pixels, as device arrays. Raises FrameError for a frame that cannot be used."""
-        size = (self.camera.height, self.camera.width)
-        if frame.depth_m.shape != size or frame.colour.shape != (*size, 3):
-            raise FrameError(f"frame {frame.index}: images of {frame.depth_m.shape} do not fit the camera's {size}")
-        in_range = without_range_limit(frame.depth_m, self.sigma_per_m2)
-        depth_m = without_flying_pixels(runtime.to_device(in_range), self.sigma_per_m2, self.camera.fx)
-        if measured_share(depth_m) < _MIN_DEPTH_SHARE:
-            raise FrameError(f"frame {frame.index}: depth in less than {_MIN_DEPTH_SHARE:.0%} of its pixels")
-        return replace(frame, colour=runtime.to_device(frame.colour), depth_m=depth_m)
-
-    @contextmanager
-    def _stage(self, name: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self._stage_s[name] = self._stage_s.get(name, 0.0) + time.perf_counter() - start
-
-    def _report(self, frame: Frame, status: FrameStatus, cue: str, result: TrackingResult) -> FrameReport:
-        return FrameReport(
-            index=frame.index,
-            timestamp_s=frame.timestamp_s,
-            status=status,
-            is_keyframe=bool(cue),
-            gaussians=self.mapper.gaussians.count,
-            stage_s=dict(self._stage_s),
-            measures=dict(result.measures),
-            message="; ".join([result.message or cue, *self._remarks]),
-            closures=self.closing.closure_count if self.closing else None,
-        )
-
-
-def _closing(camera: Camera, config: Config) -> GraphClosing | None:
-    """Imported only where it is used: gtsam takes a while to load. Raises ConfigError for closures without planes."""
-    if not (config.closures.enabled or config.loops.enabled):
-        return None
-    if config.closures.enabled and not config.planes.enabled:
-        raise ConfigError("closures.enabled needs planes: set planes.enabled=true as well")
-    from tgslam.graph.closing import GraphClosing
-
-    return GraphClosing(camera, config.loss.depth_sigma_per_m2, config.closures, config.loops)
-
-
-def _trajectory(timestamps_s: list[float], T_wc: list[NDArray[np.float64]]) -> Trajectory:
-    return Trajectory(np.array(timestamps_s, np.float64), np.array(T_wc, np.float64).reshape(-1, 4, 4))
+        return self.map.exported_planes()

@@ -123,3 +123,4 @@ class FrameReport:
     measures: dict[str, float]  # residuals, inlier ratio, condition number, gain, bias, iterations
     message: str = ""  # why it was skipped or lost, or became a keyframe
     closures: int | None = None  # edges of the pose graph besides odometry, after the frame; None = there is no graph
+    T_wc: Matrix4 | None = None  # [4, 4] camera to world, as it is known after the frame; None = it was skipped

@@ -11,7 +11,7 @@ from tgslam.bench.workloads import Scene
 from tgslam.config.map_settings import LossConfig, MappingConfig
 from tgslam.device.stopwatch import Stopwatch
 from tgslam.map.gaussians import GaussianMap
-from tgslam.map.keyframe import Keyframe
+from tgslam.map.keyframes import Keyframe
 from tgslam.mapping.refinement import Refiner
 from tgslam.types import Exposure, Frame
 
@@ -19,20 +19,19 @@ WARM_UP = 2  # iterations: the first one compiles
 
 
 def measure(scene: Scene, frame: Frame, repeats: int) -> dict[str, Any]:
-    """Refine the scene's Gaussians on the frame that they come from, with the default settings, pose included.
+    """Refine the scene's Gaussians on the frame that they come from, with the default settings.
 
     The map moves a little in every iteration, as it does in a run.
     """
     stopwatch = Stopwatch()
-    refiner = Refiner(scene.camera, MappingConfig(), LossConfig(), stopwatch)
     gaussians = GaussianMap.from_gaussians(scene.gaussians)
-    refiner.append(gaussians.count)
-    keyframe = Keyframe.from_frame(frame, np.eye(4), Exposure(), np.eye(6))
+    refiner = Refiner(gaussians, scene.camera, MappingConfig(), LossConfig(), stopwatch=stopwatch)
+    keyframe = Keyframe(frame, np.eye(4), Exposure(), np.eye(6))
     samples = Samples(stopwatch)
     for number in range(WARM_UP + repeats):
         if number == WARM_UP:
             samples.clear()
-        samples.take(lambda: refiner.step(gaussians, keyframe, move_pose=True))
+        samples.take(lambda: refiner.step(keyframe))
     return {
         "scene": scene.name,
         "width": scene.camera.width,

@@ -26,7 +26,7 @@ def measure(source: RgbdSource, config: Config, observer: FrameObserver = lambda
     Raises TrackingError when too few frames could be tracked.
     """
     system = Slam(source.camera, config)
-    stopwatch = system.tracker.stopwatch = Stopwatch()
+    stopwatch = system.front_end.tracker.stopwatch = Stopwatch()
     samples, map_s, tracked = Samples(stopwatch), [], 0
     for frame in pipeline.read_frames(source, ahead=False):
         stopwatch.seconds.clear()
@@ -46,7 +46,7 @@ def measure(source: RgbdSource, config: Config, observer: FrameObserver = lambda
         "height": source.camera.height,
         "solver": config.tracking.solver,
         "frames": len(samples),
-        "gaussians": system.mapper.gaussians.count,
+        "gaussians": system.map.gaussians.count,
         **samples.report(rest="rest of track"),
         "keyframes": len(map_s),
         "map_ms": summary_ms(map_s) if map_s else None,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,9 +15,9 @@ from tgslam.graph.pose_graph import PoseGraph
 from tgslam.graph.structure.icp import View
 from tgslam.graph.structure.search import Closure, ClosureSearch
 from tgslam.graph.visual.loop_search import LoopSearch
-from tgslam.map.keyframe import Keyframe
+from tgslam.map.keyframes import Keyframe
+from tgslam.map.world import Map
 from tgslam.planes.estimate import PlaneEstimate
-from tgslam.planes.instances.instance import NO_ID
 from tgslam.planes.instances.registry import PlaneRegistry
 from tgslam.types import Matrix4, RelativePose
 
@@ -28,13 +28,14 @@ class Correction:
 
     motions: dict[int, Matrix4]  # p_w <- motion p_w, for the keyframes that have moved; empty = stay where you are
     closures: tuple[int, ...]  # earlier keyframes to which it has an edge now
+    ties: tuple[tuple[int, int], ...]  # keyframes between which closures have moved something for the first time
 
 
 class GraphClosing:
     """Owns the pose graph.
 
-    The map's keyframes are refined between corrections, so what the graph says is applied as a motion: of its estimate
-    now against its estimate when the map last followed.
+    Where the map's keyframes are refined between corrections, the graph knows nothing of that, so what it says is told
+    as a motion: of its estimate now against its own estimate when the map last followed, which it remembers for that.
     """
 
     def __init__(self, camera: Camera, depth_sigma_per_m2: float, config: ClosureConfig, loops: LoopConfig) -> None:
@@ -45,46 +46,54 @@ class GraphClosing:
         by_planes = config.enabled and config.formulation != "landmarks"
         self._search = ClosureSearch(camera, depth_sigma_per_m2, config) if by_planes else None
         self._loops = LoopSearch(camera, depth_sigma_per_m2, loops) if loops.enabled else None
-        self._applied: list[NDArray[np.float64]] = []  # T_cw of the graph that the map follows
+        self._followed: list[NDArray[np.float64]] = []  # T_cw by the graph's estimate when the map last followed it
         self._sighted: dict[int, set[int]] = {}  # PGI -> keyframes whose sightings are in the graph
+        self._untied: list[tuple[int, int]] = []  # keyframes between which closures have moved nothing yet
 
     @property
     def closure_count(self) -> int:
         """Edges of the graph besides odometry."""
         return self._graph.closure_count
 
-    def add(self, keyframes: Sequence[Keyframe], planes: PlaneRegistry | None) -> Correction:
-        """Take in the last keyframe, mapped and, if there are planes, with them observed.
+    def close(self, world: Map, owners: Mapping[int, float]) -> Correction:
+        """Take in the latest keyframe, mapped and, if there are planes, with them observed.
 
-        Raises GraphError without a solution.
+        owners: the earlier keyframes that it was tracked against, with their shares. Raises GraphError without a
+        solution.
         """
-        self._add_odometry(keyframes)
-        if self._landmarks and planes:
-            self._add_sightings(planes)
+        latest = len(world.keyframes) - 1
+        self._add_odometry(world.keyframes[latest], latest, owners)
+        if self._landmarks and world.planes:
+            self._add_sightings(world.planes)
         T_cw = self._graph.optimise().T_cw
-        by_planes, by_looks = self._structure_closures(keyframes, planes, T_cw), self._loop_closures(keyframes, T_cw)
+        by_planes, by_looks = self._structure_closures(world, T_cw), self._loop_closures(world, T_cw)
         for closure, robust in [(c, True) for c in by_planes] + [(c, False) for c in by_looks]:
-            self._graph.add_closure(closure.earlier, len(keyframes) - 1, closure.measured.motion, robust=robust)
-        found = (*by_planes, *by_looks)
+            self._graph.add_closure(closure.earlier, latest, closure.measured.motion, robust=robust)
+        found = tuple(closure.earlier for closure in (*by_planes, *by_looks))
         if found:
             T_cw = self._graph.optimise().T_cw
-        return Correction(self._motions(T_cw), tuple(closure.earlier for closure in found))
+        self._untied += [(earlier, latest) for earlier in found]
+        motions = self._motions(T_cw)
+        ties = tuple(self._untied) if motions else ()
+        if motions:
+            self._untied = []
+        return Correction(motions, found, ties)
 
-    def _add_odometry(self, keyframes: Sequence[Keyframe]) -> None:
+    def _add_odometry(self, keyframe: Keyframe, latest: int, owners: Mapping[int, float]) -> None:
         """Tracking measures a pose against the map, that is, against the keyframes that its Gaussians were seeded from.
 
         Were it counted as a motion from the previous keyframe alone, what planes turn that one by would seem undone in
         each step that still sees the older map, and the graph would drift away from both.
         """
-        latest, T_cw = len(keyframes) - 1, keyframes[-1].T_cw
-        self._applied.append(T_cw.copy())
+        T_cw = keyframe.T_cw
+        self._followed.append(T_cw)
         if latest == 0:
             self._graph.add_first(0, T_cw)
             return
-        config, information = self._config, keyframes[-1].information
+        config, information = self._config, keyframe.information
         odometry = {}
-        for earlier, share in keyframes[-1].seen.items():
-            motion = RelativePose(T_cw @ inverse(self._applied[earlier]), information)
+        for earlier, share in owners.items():
+            motion = RelativePose(T_cw @ inverse(self._followed[earlier]), information)
             motion = motion.widened(config.odometry_sigma_rad, config.odometry_sigma_m)
             odometry[earlier] = RelativePose(motion.T_ji, share * motion.information)
         self._graph.add_keyframe(latest, odometry)
@@ -96,7 +105,7 @@ class GraphClosing:
         split = any(i.split_from is not None for k, i in instances.items() if k not in self._sighted)
         if gone or split:
             self._sighted = {plane_id: set(instance.keyframes) for plane_id, instance in instances.items()}
-            self._graph.replace_planes({k: planes.seen_from(k, surface_m) for k in range(len(self._applied))})
+            self._graph.replace_planes({k: planes.seen_from(k, surface_m) for k in range(len(self._followed))})
             return
         for plane_id, instance in instances.items():
             known = self._sighted.setdefault(plane_id, set())
@@ -106,43 +115,36 @@ class GraphClosing:
                     self._graph.add_plane_observation(keyframe, plane_id, view)
             known.update(instance.keyframes)
 
-    def _structure_closures(
-        self, keyframes: Sequence[Keyframe], planes: PlaneRegistry | None, T_cw: NDArray[np.float64]
-    ) -> tuple[Closure, ...]:
+    def _structure_closures(self, world: Map, T_cw: NDArray[np.float64]) -> tuple[Closure, ...]:
         """Of the latest keyframe with earlier ones that see the same planes."""
-        latest = len(keyframes) - 1
+        latest, planes = len(world.keyframes) - 1, world.planes
         if self._search is None or planes is None or latest == 0 or latest % self._config.interval:
             return ()
         surface_m, seen = self._config.surface_sigma_m, range(latest + 1)
         sightings: dict[int, Mapping[int, PlaneEstimate]] = {k: planes.seen_from(k, surface_m) for k in seen}
 
-        def view(keyframe: int) -> View:
-            return View(keyframes[keyframe].depth_m(), _resolved(keyframes[keyframe].plane_ids, planes))
+        def view(number: int) -> View:
+            labels = world.keyframes[number].labels
+            assert labels is not None  # closures are looked for only where planes are
+            ids = planes.table.resolved(labels.ids)[labels.places]
+            return View(world.keyframes.images(number).depth_m, ids)
 
         return self._search.find(sightings, dict(enumerate(T_cw)), self._graph.relative, view).closures
 
-    def _loop_closures(self, keyframes: Sequence[Keyframe], T_cw: NDArray[np.float64]) -> tuple[Closure, ...]:
+    def _loop_closures(self, world: Map, T_cw: NDArray[np.float64]) -> tuple[Closure, ...]:
         """Of the latest keyframe with earlier ones that look the same."""
         if self._loops is None:
             return ()
-        keyframe, latest = keyframes[-1], len(keyframes) - 1
-        poses = dict(enumerate(T_cw))
-        return self._loops.find(latest, keyframe.colour(), keyframe.depth_m(), poses, self._graph.relative).closures
+        latest, poses = len(world.keyframes) - 1, dict(enumerate(T_cw))
+        images = world.keyframes.images(latest)
+        return self._loops.find(latest, images.colour, images.depth_m, poses, self._graph.relative).closures
 
     def _motions(self, T_cw: NDArray[np.float64]) -> dict[int, Matrix4]:
         """Of all keyframes once one of them has moved enough to matter."""
-        motions = inverse(T_cw) @ np.stack(self._applied)
-        shifts_m = np.linalg.norm(inverse(T_cw)[:, :3, 3] - inverse(np.stack(self._applied))[:, :3, 3], axis=1)
+        motions = inverse(T_cw) @ np.stack(self._followed)
+        shifts_m = np.linalg.norm(inverse(T_cw)[:, :3, 3] - inverse(np.stack(self._followed))[:, :3, 3], axis=1)
         turns_rad = np.linalg.norm(motions[:, :3, :3] - np.eye(3), axis=(1, 2)) / np.sqrt(2.0)
         if shifts_m.max() < self._config.least_shift_m and turns_rad.max() < self._config.least_turn_rad:
             return {}
-        self._applied = [T.copy() for T in T_cw]
+        self._followed = [T.copy() for T in T_cw]
         return dict(enumerate(motions))
-
-
-def _resolved(plane_ids: NDArray[np.int16] | None, planes: PlaneRegistry) -> NDArray[np.int32]:
-    """[H, W] of a keyframe, under the ids that PGIs have by now."""
-    assert plane_ids is not None  # closures are looked for only where planes are
-    known, place = np.unique(plane_ids, return_inverse=True)
-    now = np.array([planes.resolve(int(i)) if i >= 0 else NO_ID for i in known], np.int32)
-    return now[place].reshape(plane_ids.shape)

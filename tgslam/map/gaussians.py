@@ -1,79 +1,128 @@
-"""The map: Gaussians as a structure of device arrays with spare capacity, so that adding is an append."""
+"""The map's Gaussians: one table with everything that is known of each of them."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.device import runtime
+from tgslam.map.table import Column, Table
 from tgslam.ops import rigid
+from tgslam.ops.splats import WIDTHS
 from tgslam.types import Gaussians
 
-_FLOAT_FIELDS = {"mean": 3, "log_scale": 3, "quat_wxyz": 4, "opacity_logit": 0, "colour": 3, "embedding": 3}
-_INT_FIELDS = ("plane_id", "birth_keyframe")
-PARAMETERS = tuple(_FLOAT_FIELDS)
+PARAMETERS = tuple(WIDTHS)  # what is differentiated
+CARRIERS = 8  # keyframes that a Gaussian follows: twice as many move the map no better, half as many tear it a little
 
-
-def _shape(rows: int, columns: int) -> tuple[int, ...]:
-    return (rows, columns) if columns else (rows,)
-
-
-def grown(array: np.ndarray, count: int, capacity: int) -> np.ndarray:
-    """A device array with `capacity` zeroed rows that holds the first `count` rows of `array`."""
-    host = runtime.to_host(array)
-    larger = np.zeros((capacity, *host.shape[1:]), host.dtype)
-    larger[:count] = host[:count]
-    return runtime.to_device(larger, host.dtype.type)
+_COLUMNS = (
+    *(Column(name, width) for name, width in WIDTHS.items()),
+    Column("plane_id", dtype=np.int32),  # -1 = on none
+    Column("birth_keyframe", dtype=np.int32),
+    Column("carriers", CARRIERS, np.int32),  # keyframes that it follows, see `mapping.carriers`
+    Column("contribution"),  # px, since birth the most blend weight in any view
+    Column("views", dtype=np.int32),  # rendered with it in sight
+    Column("guessed", dtype=np.bool_, on_host=True),  # seeded where no depth was measured
+    Column("information", dtype=np.float64, on_host=True),  # 1/m^2, what is known of its depth
+    Column("support", dtype=np.int32, on_host=True),  # keyframes whose depth agrees with it
+    Column("conflict", dtype=np.int32, on_host=True),  # keyframes that see through it
+)
+_FIELDS = tuple(Gaussians.__dataclass_fields__)
+_FIRST_CAPACITY = 4096
 
 
 class GaussianMap:
-    """Parameters of all Gaussians, as in `types.Gaussians`; rows [0, count) are in use."""
+    """Owns the Gaussians. Kernels change parameters in place; rows and all other columns change through here."""
 
-    def __init__(self, capacity: int = 4096) -> None:
-        self.count = 0
-        self.capacity = capacity
-        self.mean = runtime.zeros((capacity, 3))
-        self.log_scale = runtime.zeros((capacity, 3))
-        self.quat_wxyz = runtime.zeros((capacity, 4))
-        self.opacity_logit = runtime.zeros((capacity,))
-        self.colour = runtime.zeros((capacity, 3))
-        self.embedding = runtime.zeros((capacity, 3))
-        self.plane_id = runtime.zeros((capacity,), np.int32)
-        self.birth_keyframe = runtime.zeros((capacity,), np.int32)
+    def __init__(self, capacity: int = _FIRST_CAPACITY) -> None:
+        self._table = Table(_COLUMNS, capacity)
 
     @classmethod
     def from_gaussians(cls, gaussians: Gaussians) -> GaussianMap:
-        """A map that holds these Gaussians."""
+        """A map that holds these Gaussians, of which nothing else is known."""
         result = cls(max(len(gaussians), 1))
         result.append(gaussians)
         return result
 
-    def append(self, gaussians: Gaussians) -> None:
-        """Add rows at the end, doubling the capacity when it is used up."""
-        count = self.count + len(gaussians)
-        if count > self.capacity:
-            capacity = max(2 * self.capacity, count)
-            for name in (*PARAMETERS, *_INT_FIELDS):
-                setattr(self, name, grown(getattr(self, name), self.count, capacity))
-            self.capacity = capacity
-        for name in (*PARAMETERS, *_INT_FIELDS):
-            self.write(name, slice(self.count, count), getattr(gaussians, name))
-        self.count = count
+    @property
+    def count(self) -> int:
+        """Gaussians."""
+        return self._table.count
+
+    @property
+    def capacity(self) -> int:
+        """Rows of each device array, of which [0, count) are in use."""
+        return self._table.capacity
+
+    @property
+    def mean(self) -> np.ndarray:
+        """[capacity, 3] m, world."""
+        return self._table.array("mean")
+
+    @property
+    def log_scale(self) -> np.ndarray:
+        """[capacity, 3] log of the standard deviations, m."""
+        return self._table.array("log_scale")
+
+    @property
+    def quat_wxyz(self) -> np.ndarray:
+        """[capacity, 4] local to world, of any length but zero."""
+        return self._table.array("quat_wxyz")
+
+    @property
+    def opacity_logit(self) -> np.ndarray:
+        """[capacity]."""
+        return self._table.array("opacity_logit")
+
+    @property
+    def colour(self) -> np.ndarray:
+        """[capacity, 3] RGB."""
+        return self._table.array("colour")
+
+    @property
+    def embedding(self) -> np.ndarray:
+        """[capacity, 3] theta of Eq. 1."""
+        return self._table.array("embedding")
+
+    @property
+    def plane_id(self) -> np.ndarray:
+        """[capacity] int32, -1 = on none."""
+        return self._table.array("plane_id")
+
+    def array(self, name: str) -> np.ndarray:
+        """A column with its spare rows, where it lives."""
+        return self._table.array(name)
+
+    def host(self, name: str) -> np.ndarray:
+        """The rows in use of a column on the host, to be read: a view on the CPU, a copy under CUDA."""
+        return self._table.host(name)
+
+    def write(self, name: str, rows: slice | NDArray[np.integer] | NDArray[np.bool_], values: np.ndarray) -> None:
+        """Set rows of a column from host values."""
+        self._table.write(name, rows, values)
+
+    def add_columns(self, columns: Iterable[Column]) -> None:
+        """Columns for somebody's own bookkeeping, zero in all rows and in those that come."""
+        for column in columns:
+            self._table.add_column(column)
+
+    def append(self, gaussians: Gaussians, **known: np.ndarray) -> None:
+        """Add rows at the end. known: values of other columns; the rest is zero.
+
+        Without carriers, a Gaussian follows the keyframe that it was born with.
+        """
+        values = {name: getattr(gaussians, name) for name in _FIELDS} | known
+        values.setdefault("carriers", np.repeat(gaussians.birth_keyframe[:, None], CARRIERS, 1))
+        self._table.append(len(gaussians), values)
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Remove the rows where `mask` [count] is false; the order of the rest stays."""
-        kept = int(mask.sum())
-        for name in (*PARAMETERS, *_INT_FIELDS):
-            rows = runtime.to_host(getattr(self, name))[: self.count][mask]
-            self.write(name, slice(0, kept), rows)
-        self.count = kept
+        if not mask.all():
+            self._table.keep(mask)
 
-    def move(self, motions: NDArray[np.float64], carriers: NDArray[np.int32]) -> None:
-        """Move each row by the mean of some motions: p_w <- mean of motions[carriers] p_w.
-
-        motions: rigid, [K, 4, 4]. carriers: [count, S] which of them.
-        """
-        rigid.move_rows(motions, runtime.to_device(carriers, np.int32), self.mean, self.quat_wxyz, self.count)
+    def move(self, motions: NDArray[np.float64]) -> None:
+        """Move each row by the mean of its carriers' motions, p_w <- motion p_w: rigid, [K, 4, 4] by keyframe."""
+        rigid.move_rows(motions, self.array("carriers"), self.mean, self.quat_wxyz, self.count)
 
     def gaussians(self) -> Gaussians:
         """A copy on the host."""
@@ -81,15 +130,4 @@ class GaussianMap:
 
     def rows(self, numbers: NDArray[np.integer]) -> Gaussians:
         """A copy of some rows on the host."""
-        return Gaussians(**{name: self.host(name)[numbers] for name in (*PARAMETERS, *_INT_FIELDS)})
-
-    def host(self, name: str) -> np.ndarray:
-        """The rows in use of one parameter on the host: a view on the CPU, a copy under CUDA."""
-        return runtime.to_host(getattr(self, name))[: self.count]
-
-    def write(self, name: str, rows: slice | NDArray[np.integer], values: np.ndarray) -> None:
-        """Set rows of one parameter from host values."""
-        host = runtime.to_host(getattr(self, name))
-        host[rows] = values
-        if runtime.device() is not runtime.Device.CPU:
-            setattr(self, name, runtime.to_device(host, host.dtype.type))
+        return Gaussians(**{name: self.host(name)[numbers] for name in _FIELDS})

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam.camera import SensorNoise
 from tgslam.config.plane_settings import PlanesConfig
 from tgslam.geometry import inverse
 from tgslam.planes.instances.instance import NO_ID, PlanarInstance
@@ -24,10 +25,10 @@ class KnownExtents:
         rays: Points,
         T_cw: NDArray[np.float64],
         config: PlanesConfig,
-        sigma_per_m2: float,
+        noise: SensorNoise,
     ) -> None:
         """instances: the PGIs by id. depth_m: [H, W] m. rays: [H, W, 3] camera frame, z = 1."""
-        self._instances, self._config, self._sigma_per_m2 = instances, config, sigma_per_m2
+        self._instances, self._config, self._noise = instances, config, noise
         self._depth_m, self._rays, self._T_cw, self._T_wc = depth_m, rays, T_cw, inverse(T_cw)
 
     def completed(self, ids: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -80,6 +81,6 @@ class KnownExtents:
         normal = self._T_cw[:3, :3] @ instance.normal_w
         offset_m = instance.offset_m + float(instance.normal_w @ self._T_wc[:3, 3])
         along = normal[0] * points[0] + normal[1] * points[1] + normal[2] * points[2]
-        sigma_m = self._sigma_per_m2 * points[2] * along
+        sigma_m = self._noise.per_m2 * points[2] * along
         result: Points = (along + offset_m) ** 2 / (sigma_m**2 + self._config.model_sigma_m**2)
         return result

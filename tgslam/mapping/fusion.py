@@ -9,14 +9,76 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam.camera import Camera, SensorNoise
+from tgslam.config.map_settings import SeedingConfig
 from tgslam.device import runtime
-from tgslam.geometry import matrix_from_quat_wxyz, quat_product_wxyz
+from tgslam.geometry import inverse, matrix_from_quat_wxyz, quat_product_wxyz
+from tgslam.map.world import Map
+from tgslam.mapping.carriers import CarrierDraw
+from tgslam.mapping.insertion import cell_levels
+from tgslam.mapping.surface import Surface
 from tgslam.ops import image as images
 
-_MAX_OBSERVATIONS = (
-    30.0  # information grows to so many of the present view and no further: a map must be able to follow
-)
+# Information grows to so many of the present view and no further: a map must be able to follow
+_MAX_OBSERVATIONS = 30.0
 _MAX_TURN_COSINE = 0.5  # normals further apart than 60 degrees are of different surfaces
+_MIN_COSINE = 0.1  # a surface more grazing than this says nothing of the depth beside
+_MAX_SLANT = 0.1  # nor one whose depth changes by more within a block
+
+
+class DepthFusion:
+    """Averages a keyframe's depth and normals into the Gaussians that it supports."""
+
+    def __init__(
+        self, camera: Camera, noise: SensorNoise, seeding: SeedingConfig, limit_sigmas: float, draw: CarrierDraw
+    ) -> None:
+        """limit_sigmas: a measurement farther off, in standard deviations of the sensor, is of another surface."""
+        self._camera, self._noise, self._limit_sigmas, self._draw = camera, noise, limit_sigmas, draw
+        self._overlap, self._levels = seeding.overlap, cell_levels(seeding, camera.width)
+
+    def fuse(self, world: Map, number: int, surface: Surface, kept: NDArray[np.bool_]) -> None:
+        """Take in keyframe `number`. surface: how the first N Gaussians stand to it; kept: [N] those to be moved."""
+        use = surface.supported & kept
+        rows = np.flatnonzero(use)
+        if not len(rows):
+            return
+        gaussians, images_, T_cw = world.gaussians, world.keyframes.images(number), world.keyframes[number].T_cw
+        at = use[surface.inside]
+        u, v, z = surface.u[at], surface.v[at], surface.z[use]
+        means, scales = gaussians.host("mean"), gaussians.host("log_scale")
+        width_px = np.exp(np.sort(scales[rows], -1)[:, 1]) * self._camera.fx / (z * self._overlap)
+        measured, block_px = sample(depth_pyramid(images_.depth_m, self._levels + 1), u, v, width_px)
+        rotations = gaussians.host("quat_wxyz")[rows].astype(np.float64)
+        normals_c = matrix_from_quat_wxyz(rotations)[:, :, 2] @ T_cw[:3, :3].T
+        centres = block_centre(u, block_px), block_centre(v, block_px)
+        measured *= self._slant(normals_c, centres, (surface.exact_u[use], surface.exact_v[use]))
+        sigma_m = self._noise.sigma_m(z)
+        agrees = (measured > 0) & (np.abs(measured - z) < self._limit_sigmas * sigma_m)
+        evidence = np.where(agrees, block_px**2 / sigma_m**2, 0.0)
+        fused, information, gain = fused_depth(z, gaussians.host("information")[rows], measured, evidence)
+        gaussians.write("information", rows, information)
+        gaussians.write("carriers", rows, self._draw(gaussians.host("carriers")[rows], number, gain))
+        T_wc = inverse(T_cw)
+        towards = images_.normals[v, u].astype(np.float64) @ T_wc[:3, :3].T
+        gaussians.write("mean", rows, T_wc[:3, 3] + (fused / z)[:, None] * (means[rows] - T_wc[:3, 3]))
+        gaussians.write("quat_wxyz", rows, turned(rotations, towards, gain))
+
+    def _slant(
+        self,
+        normals_c: NDArray[np.float64],
+        seen_at: tuple[NDArray[np.float64], NDArray[np.float64]],
+        wanted_at: tuple[NDArray[np.float64], NDArray[np.float64]],
+    ) -> NDArray[np.float64]:
+        """Depth at one pixel over depth at another [N], on planes with those normals [N, 3]; 1 where it is unclear."""
+        camera = self._camera
+        seen, wanted = (
+            normals_c[:, 0] * (u - camera.cx) / camera.fx
+            + normals_c[:, 1] * (v - camera.cy) / camera.fy
+            + normals_c[:, 2]
+            for u, v in (seen_at, wanted_at)
+        )
+        ratio = seen / np.where(np.abs(wanted) > _MIN_COSINE, wanted, np.inf)
+        return np.where(np.abs(ratio - 1.0) < _MAX_SLANT, ratio, 1.0)
 
 
 def depth_pyramid(depth_m: NDArray[np.float32], levels: int) -> list[NDArray[np.float32]]:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.camera import Camera
+from tgslam.camera import Camera, SensorNoise
 from tgslam.config.map_settings import SeedingConfig
 from tgslam.device import runtime
 from tgslam.geometry import inverse, quat_wxyz_from_matrices, transform_points
@@ -37,7 +37,7 @@ def cell_sizes(
     colour: NDArray[np.floating],
     depth_m: NDArray[np.floating],
     config: SeedingConfig,
-    sigma_per_m2: float,
+    noise: SensorNoise,
     plane_ids: NDArray[np.int32] | None = None,
 ) -> NDArray[np.int32]:
     """The quadtree of a frame: the size in pixels of the cell at each of its smallest cells, [rows, columns].
@@ -46,7 +46,7 @@ def cell_sizes(
     those of the frame with zeros at the right and bottom, so that the largest cells tile it. plane_ids: [H, W] PGI of
     each pixel, -1 = none; on one of them cells may be larger still, and the colour need only be plain but for a trend.
     """
-    whole = _whole_cells(colour, depth_m, config, sigma_per_m2, plane_ids)
+    whole = _whole_cells(colour, depth_m, config, noise, plane_ids)
     sizes = np.full(whole[0].shape, config.smallest_cell_px, np.int32)
     for level in range(1, len(whole)):
         sizes[_spread(whole[level], 1 << level) > 0] = config.smallest_cell_px << level
@@ -63,7 +63,7 @@ def _whole_cells(
     colour: NDArray[np.floating],
     depth_m: NDArray[np.floating],
     config: SeedingConfig,
-    sigma_per_m2: float,
+    noise: SensorNoise,
     plane_ids: NDArray[np.int32] | None,
 ) -> list[NDArray[np.int32]]:
     """By level [rows, columns] of `ops.seeding`: the cells that one Gaussian can stand for, or that lie in such."""
@@ -82,7 +82,7 @@ def _whole_cells(
             config.smallest_cell_px << level,
             plain_std=config.plain_colour_std,
             plane_std=config.plane_colour_std,
-            planar_rms=config.planar_sigmas * sigma_per_m2,
+            planar_rms=config.planar_sigmas * noise.per_m2,
             on_planes_only=level >= plain_levels,
         )
         whole.append(cells)
@@ -114,7 +114,7 @@ def quadtree(
     depth_m: NDArray[np.floating],
     wanted: NDArray[np.bool_],
     config: SeedingConfig,
-    sigma_per_m2: float,
+    noise: SensorNoise,
     plane_ids: NDArray[np.int32] | None = None,
 ) -> Cells:
     """Cells that cover the `wanted` pixels [H, W] with depth, from the largest size down to `smallest_cell_px`.
@@ -123,7 +123,7 @@ def quadtree(
     their pixels with depth. plane_ids: as for `cell_sizes`. On a plane, where Gaussians may overlap without harm, cells
     of every size are used that are wanted in half or more, and nothing smaller than the second size.
     """
-    whole = _whole_cells(colour, depth_m, config, sigma_per_m2, plane_ids)
+    whole = _whole_cells(colour, depth_m, config, noise, plane_ids)
     shape = (whole[0].shape[0] * config.smallest_cell_px, whole[0].shape[1] * config.smallest_cell_px)
     depth, rgb = _padded(depth_m, shape), _padded(colour, shape)
     valid = depth > 0
@@ -139,7 +139,7 @@ def quadtree(
             use = open_cells & mostly & (on_plane | ((whole[level] > 0) & (needed == count)))
         else:
             use = open_cells & mostly
-        found.append(_means(use, depth, rgb, size, None if level else sigma_per_m2))  # larger ones are planar
+        found.append(_means(use, depth, rgb, size, None if level else noise))  # larger ones are planar
         if level:
             crumbs = on_plane & ~mostly if level == 1 else np.zeros(use.shape, bool)
             open_cells = np.repeat(np.repeat(open_cells & ~use & ~crumbs, 2, 0), 2, 1)
@@ -183,18 +183,18 @@ def _means(
     depth: NDArray[np.floating],
     rgb: NDArray[np.floating],
     size: int,
-    sigma_per_m2: float | None,
+    noise: SensorNoise | None,
 ) -> tuple[NDArray[np.float64], ...]:
     """The columns of `Cells` for the blocks [rows, columns] in `use`, from their pixels with depth.
 
-    sigma_per_m2: the sensor's noise, by which to tell pixels on one surface from others; None = all are on one.
+    noise: the sensor's, by which to tell pixels on one surface from others; None = all are on one.
     """
     row, column = np.nonzero(use)
     within_y, within_x = np.divmod(np.arange(size * size), size)
     at = row[:, None] * size + within_y, column[:, None] * size + within_x
     z, colours = depth[at].astype(np.float64), rgb[at].astype(np.float64)
     inverse_z = 1.0 / np.where(z > 0, z, np.inf)
-    alike = inverse_z > 0 if sigma_per_m2 is None else _on_one_surface(inverse_z, sigma_per_m2)
+    alike = inverse_z > 0 if noise is None else _on_one_surface(inverse_z, noise)
     weight = alike / alike.sum(-1, keepdims=True)
     return (
         column * size + weight @ within_x,
@@ -205,16 +205,16 @@ def _means(
     )
 
 
-def _on_one_surface(inverse_z: NDArray[np.float64], sigma_per_m2: float) -> NDArray[np.bool_]:
+def _on_one_surface(inverse_z: NDArray[np.float64], noise: SensorNoise) -> NDArray[np.bool_]:
     """Which pixels [N, P] of a cell show the surface that most of them show, the nearer one of two that are even.
 
     The mean of two surfaces would hang in the air between them. inverse_z: [N, P] 1/m, 0 = no depth, at least one > 0 a
-    cell; its noise is the same at every depth, sigma_per_m2.
+    cell; its noise is the same at every depth.
     """
     ordered = np.sort(inverse_z, -1)  # no depth first, then from far to near
     known = (inverse_z > 0).sum(-1)
     median = np.take_along_axis(ordered, (inverse_z.shape[1] - known + known // 2)[:, None], -1)
-    tolerance = np.maximum(_STEP * median, _STEP_SIGMAS * sigma_per_m2)
+    tolerance = np.maximum(_STEP * median, _STEP_SIGMAS * noise.per_m2)
     alike: NDArray[np.bool_] = (inverse_z > 0) & (np.abs(inverse_z - median) <= tolerance)
     return alike
 
@@ -236,7 +236,7 @@ def seed(
     n = len(cells.u)
     row, column = np.rint(cells.v).astype(int), np.rint(cells.u).astype(int)
     ids = np.full(n, -1, np.int32) if plane_ids is None else plane_ids[row, column]
-    ray = np.stack([(cells.u - camera.cx) / camera.fx, (cells.v - camera.cy) / camera.fy, np.ones(n)], -1)
+    ray = camera.rays_at(cells.u, cells.v)
     towards = -ray / np.linalg.norm(ray, axis=-1, keepdims=True)
     normal = normals[row, column].astype(np.float64)
     known = (normal * towards).sum(-1) > 0.05

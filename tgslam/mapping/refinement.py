@@ -1,31 +1,40 @@
-"""Refining the map and keyframe poses under the total objective (Eq. 14), one view at a time."""
+"""A step of refining the map under the total objective (Eq. 14), on one view."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.map_settings import LossConfig, MappingConfig, StructureConfig
+from tgslam.config.map_settings import LossConfig, MappingConfig
+from tgslam.config.plane_settings import StructureConfig
 from tgslam.device import runtime
 from tgslam.device.stopwatch import Stopwatch, stage
-from tgslam.geometry import orthonormalized, se3_exp
 from tgslam.map.gaussians import GaussianMap
-from tgslam.map.keyframe import Keyframe
-from tgslam.mapping.sightings import Sightings
+from tgslam.map.keyframes import Keyframe
+from tgslam.map.table import Column
 from tgslam.mapping.structure_terms import StructureTerms
 from tgslam.ops import loss as losses
-from tgslam.ops import relaxation
+from tgslam.ops import relaxation, rows
 from tgslam.ops.adam import Adam
 from tgslam.ops.instance_field import InstanceGradient
 from tgslam.ops.rasterize import ImageGradient, Rasterizer
 from tgslam.ops.splats import MapGradient
-from tgslam.ops.vector_adam import VectorAdam
-from tgslam.planes.instances.plane_table import PlaneTable
+from tgslam.types import Matrix4
 
 _GEOMETRY = {"mean": 3, "log_scale": 3, "quat_wxyz": 4, "opacity_logit": 0}
+_MOMENTS, _STEPS = "adam_moments", "adam_steps"
+
+
+@dataclass(frozen=True)
+class Step:
+    """What a step has found before it moved the map."""
+
+    loss: losses.LossResult  # its numbers can be read until the next step
+    g_pose: NDArray[np.float64]  # [6] derivative by a left perturbation of the view's pose
 
 
 class Refiner:
@@ -33,73 +42,42 @@ class Refiner:
 
     def __init__(
         self,
+        gaussians: GaussianMap,
         camera: Camera,
         config: MappingConfig,
         loss: LossConfig,
-        stopwatch: Stopwatch | None = None,
         structure: StructureConfig | None = None,
+        stopwatch: Stopwatch | None = None,
     ) -> None:
-        """stopwatch: takes the seconds of the stages forward, loss, backward and update, for benchmarks.
+        """gaussians: the map that is refined; it gets columns for what the optimiser remembers.
 
-        structure: of the terms that planes add (`set_planes`, `Keyframe.plane_ids`); None = planes play no part.
+        structure: of the terms that planes add; None = planes play no part. stopwatch: takes the seconds of the stages
+        forward, loss, backward and update, for benchmarks.
         """
-        self.config, self.loss, self.stopwatch = config, loss, stopwatch
+        self.gaussians, self.config, self.loss, self.stopwatch = gaussians, config, loss, stopwatch
         self.structure = StructureTerms(camera, structure, config.window + config.anchor_count) if structure else None
         self.rasterizer = Rasterizer(camera)
-        self.adam = _optimiser(config, camera)
-        self._sightings = Sightings()
+        self._adam = _optimiser(config, camera)
+        gaussians.add_columns((Column(_MOMENTS, self._adam.moment_width), Column(_STEPS, dtype=np.int32)))
         self._gradient = MapGradient.zeros(1)
         self._workspace = losses.Workspace(camera.height, camera.width)
         self._observations: OrderedDict[int, losses.Observation] = OrderedDict()
-        self._pose_steps: dict[int, VectorAdam] = {}
-
-    @property
-    def contribution(self) -> NDArray[np.float32]:
-        """[N] px, since birth the most blend weight of each Gaussian in any view."""
-        return self._sightings.contribution
-
-    @property
-    def views(self) -> NDArray[np.int32]:
-        """[N] views rendered with the Gaussian in sight."""
-        return self._sightings.views
-
-    def append(self, rows: int) -> None:
-        """The map has grown by that many rows."""
-        self.adam.append(rows)
-        self._sightings.append(rows)
-
-    def keep(self, mask: NDArray[np.bool_]) -> None:
-        """The map has lost the rows where the mask [N] is false."""
-        self.adam.keep(mask)
-        self._sightings.keep(mask)
-
-    def set_planes(self, planes: PlaneTable) -> None:
-        """The planes as they are now; without terms of structure they do not matter."""
-        if self.structure:
-            self.structure.set_planes(planes)
 
     def step(
-        self,
-        gaussians: GaussianMap,
-        keyframe: Keyframe,
-        *,
-        move_pose: bool,
-        pace: float = 1.0,
-        colour_pace: float = 1.0,
-    ) -> losses.LossResult:
-        """Render the map at the keyframe, and move the map (and the keyframe's pose) downhill.
+        self, keyframe: Keyframe, T_cw: Matrix4 | None = None, *, pace: float = 1.0, colour_pace: float = 1.0
+    ) -> Step:
+        """Render the map at the keyframe and move it downhill.
 
-        pace: what the map's steps are multiplied by, but for those of embeddings.
-        colour_pace: and those of colours besides.
-
-        Returns the loss before the step; its numbers can be read until the next step. Only the pose's gradient goes to
-        the host by itself.
+        T_cw: [4, 4] where the keyframe is believed to be, by default its pose. pace: what the map's steps are
+        multiplied by, but for those of embeddings; colour_pace: and those of colours besides. Only the pose's gradient
+        goes to the host by itself.
         """
         observation = self._observation(keyframe)
         target = self.structure.due(keyframe) if self.structure else None
         gain, bias = 1.0 / keyframe.exposure.gain, -keyframe.exposure.bias / keyframe.exposure.gain
         with stage(self.stopwatch, "forward"):
-            rendered = self.rasterizer.forward(gaussians, keyframe.T_cw, with_embedding=target is not None)
+            pose = keyframe.T_cw if T_cw is None else T_cw
+            rendered = self.rasterizer.forward(self.gaussians, pose, with_embedding=target is not None)
         with stage(self.stopwatch, "loss"):
             loss = losses.rgbd_loss(
                 rendered.colour, rendered.depth, rendered.opacity, observation, self.loss, gain, bias,
@@ -107,47 +85,39 @@ class Refiner:
             )  # fmt: skip
             pgi = self.structure.pgi(rendered, target, loss.g_opacity) if self.structure and target else None
         with stage(self.stopwatch, "backward"):
-            g_pose = self._backward(gaussians, loss, pgi)
+            g_pose = self._backward(loss, pgi)
         with stage(self.stopwatch, "update"):
-            self._update_map(gaussians, loss, pgi, pace, pace * colour_pace)
-            if move_pose:
-                self._update_pose(keyframe, g_pose)
-        return loss
+            self._update(loss, pgi, pace, pace * colour_pace)
+        return Step(loss, g_pose)
 
-    def _backward(
-        self, gaussians: GaussianMap, loss: losses.LossResult, pgi: InstanceGradient | None
-    ) -> NDArray[np.float64]:
+    def _backward(self, loss: losses.LossResult, pgi: InstanceGradient | None) -> NDArray[np.float64]:
         """Fill the map's gradient; returns the pose's [6].
 
         Nothing here moves by the curvature of depth, so that E_pgi's takes its place where there is one.
         """
-        if self._gradient.mean.shape[0] != gaussians.capacity:
-            self._gradient = MapGradient.zeros(gaussians.capacity)
+        if self._gradient.mean.shape[0] != self.gaussians.capacity:
+            self._gradient = MapGradient.zeros(self.gaussians.capacity)
         else:
             self._gradient.clear()
         g = ImageGradient(
             loss.g_colour, loss.g_depth, loss.g_opacity, pgi.embedding if pgi else None,
             colour_weight=loss.w_colour, depth_weight=pgi.weight if pgi else loss.w_depth,
         )  # fmt: skip
-        return self.rasterizer.backward(gaussians, g, self._gradient)
+        return self.rasterizer.backward(self.gaussians, g, self._gradient)
 
-    def _update_map(
-        self,
-        gaussians: GaussianMap,
-        loss: losses.LossResult,
-        pgi: InstanceGradient | None,
-        pace: float,
-        colour_pace: float,
-    ) -> None:
-        gradient, visible = self._gradient, self.rasterizer.tile_count
+    def _update(self, loss: losses.LossResult, pgi: InstanceGradient | None, pace: float, colour_pace: float) -> None:
+        gaussians, gradient, visible = self.gaussians, self._gradient, self.rasterizer.tile_count
         if self.structure:
             self.structure.regularise(gaussians, visible, gradient)
             if pgi:
-                self.structure.move_embeddings(gaussians, visible, gradient, self._sightings, pgi.target)
-        names = list(self.adam.learning_rates)
-        self.adam.step(
-            {name: getattr(gaussians, name) for name in names},
+                self.structure.move_embeddings(gaussians, visible, gradient, pgi.target)
+        names = list(self._adam.learning_rates)
+        self._adam.step(
+            gaussians.count,
+            {name: gaussians.array(name) for name in names},
             {name: getattr(gradient, name) for name in names},
+            gaussians.array(_MOMENTS),
+            gaussians.array(_STEPS),
             visible,
             pace,
         )
@@ -157,11 +127,10 @@ class Refiner:
                 gaussians.count, visible, gradient.colour, gradient.curvature, loss.totals,
                 colour_pace * self.config.relaxation, weight, gaussians.colour,
             )  # fmt: skip
-        self._sightings.record(visible, gradient.curvature, loss.totals, weight)
-
-    def _update_pose(self, keyframe: Keyframe, g_pose: NDArray[np.float64]) -> None:
-        adam = self._pose_steps.setdefault(keyframe.index, VectorAdam([self.config.rate_pose] * 6))
-        keyframe.T_cw = orthonormalized(se3_exp(adam.step(g_pose)) @ keyframe.T_cw)
+        rows.record_view(
+            gaussians.count, visible, gradient.curvature, loss.totals, weight, gaussians.array("contribution"),
+            gaussians.array("views"),
+        )  # fmt: skip
 
     def _observation(self, keyframe: Keyframe) -> losses.Observation:
         """The keyframe's side of the loss; the most recently used are kept."""

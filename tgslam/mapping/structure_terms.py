@@ -5,20 +5,19 @@ from __future__ import annotations
 from collections import OrderedDict
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.map_settings import StructureConfig
+from tgslam.config.plane_settings import StructureConfig
 from tgslam.device import runtime
 from tgslam.map.gaussians import GaussianMap
-from tgslam.map.keyframe import Keyframe
-from tgslam.mapping.sightings import Sightings
+from tgslam.map.keyframes import Keyframe
+from tgslam.map.plane_labels import PlaneLabels
 from tgslam.ops import instance_field
 from tgslam.ops.instance_field import InstanceGradient, InstanceTarget
 from tgslam.ops.plane_regularisers import PlaneRegularisers
 from tgslam.ops.render_images import RenderImages
 from tgslam.ops.splats import MapGradient
-from tgslam.planes.identity.codes import code_table, initial_theta
+from tgslam.planes.identity.codes import code_table
 from tgslam.planes.instances.plane_table import PlaneTable
 
 
@@ -31,30 +30,30 @@ class StructureTerms:
         self._kept_targets = kept_targets
         self._workspace = instance_field.Workspace(camera.height, camera.width)
         self._regularisers = PlaneRegularisers(config)
-        self._targets: OrderedDict[int, tuple[NDArray[np.int16], InstanceTarget]] = OrderedDict()
-        self._visits: dict[int, tuple[NDArray[np.int16], int]] = {}  # by keyframe, since it has had these ids
-        self.set_planes(PlaneTable.empty())
+        self._targets: OrderedDict[int, tuple[int, InstanceTarget]] = OrderedDict()  # by keyframe, of that version
+        self._visits: dict[int, tuple[int, int]] = {}  # by keyframe, since its labels have this version
+        self._version = -1
+        self.know(PlaneTable.empty(), 0)
 
-    def set_planes(self, table: PlaneTable) -> None:
-        """The planes as they are now; call it when one was added, refitted, merged or removed."""
-        self._planes = runtime.to_device(table.planes_w) if len(table) else None
-        self.codes = runtime.to_device(code_table(table.ids, self.config))
-
-    def initial_embedding(self, plane_ids: NDArray[np.int32]) -> NDArray[np.float32]:
-        """[N, 3] of new Gaussians on these planes [N], -1 = on none."""
-        return initial_theta(plane_ids, self.config)
+    def know(self, table: PlaneTable, version: int) -> None:
+        """The planes as they are now. version: of the table; nothing is done for one that is known."""
+        if version != self._version:
+            self._version = version
+            self._planes = runtime.to_device(table.planes_w) if len(table) else None
+            self.codes = runtime.to_device(code_table(table.ids, self.config))
 
     def due(self, keyframe: Keyframe) -> InstanceTarget | None:
         """The keyframe's target, if E_pgi takes part in this step: embeddings converge in few, so not in each.
 
         It does as soon as what the keyframe shows of planes has changed.
         """
-        if keyframe.plane_ids is None or self.config.lambda_pgi == 0.0:
+        if keyframe.labels is None or self.config.lambda_pgi == 0.0:
             return None
-        ids, visit = self._visits.get(keyframe.index, (keyframe.plane_ids, 0))
-        visit = visit if ids is keyframe.plane_ids else 0
-        self._visits[keyframe.index] = keyframe.plane_ids, visit + 1
-        return self._target(keyframe, keyframe.plane_ids) if visit % self.config.pgi_interval == 0 else None
+        version = keyframe.label_version
+        known, visit = self._visits.get(keyframe.index, (version, 0))
+        visit = visit if known == version else 0
+        self._visits[keyframe.index] = version, visit + 1
+        return self._target(keyframe, keyframe.labels) if visit % self.config.pgi_interval == 0 else None
 
     def pgi(self, rendered: RenderImages, target: InstanceTarget, g_opacity: np.ndarray) -> InstanceGradient:
         """E_pgi at a rendering; its derivative by opacity is added to g_opacity [H, W]."""
@@ -72,13 +71,12 @@ class StructureTerms:
         gaussians: GaussianMap,
         visible: np.ndarray,
         gradient: MapGradient,
-        sightings: Sightings,
         target: InstanceTarget,
     ) -> None:
         """Relax the embeddings; the curvature's second column must hold the weights of E_pgi."""
         instance_field.relax(
-            gaussians.count, visible, gradient.embedding, gradient.curvature, sightings.most_px, target, self.config,
-            gaussians.embedding,
+            gaussians.count, visible, gradient.embedding, gradient.curvature, gaussians.array("contribution"), target,
+            self.config, gaussians.embedding,
         )  # fmt: skip
 
     @property
@@ -86,11 +84,11 @@ class StructureTerms:
         """Means of E_str's terms in the last step that had it: flat, normal, distance; count of Gaussians."""
         return self._regularisers.parts
 
-    def _target(self, keyframe: Keyframe, plane_ids: NDArray[np.int16]) -> InstanceTarget:
+    def _target(self, keyframe: Keyframe, labels: PlaneLabels) -> InstanceTarget:
         known = self._targets.pop(keyframe.index, None)
-        if known is None or known[0] is not plane_ids:
+        if known is None or known[0] != keyframe.label_version:
             depth_m = runtime.to_device(keyframe.depth_m())
-            known = plane_ids, instance_field.prepare(plane_ids, depth_m, self.config)
+            known = keyframe.label_version, instance_field.prepare(labels.image(), depth_m, self.config)
         self._targets[keyframe.index] = known
         while len(self._targets) > self._kept_targets:
             self._targets.popitem(last=False)

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from tgslam.camera import Camera
 from tgslam.geometry import matrix_from_quat_wxyz, transform_points
 from tgslam.map.gaussians import GaussianMap
-from tgslam.map.keyframe import Keyframe
 from tgslam.ops.splats import IMAGE_EDGE
 
 _NEAR_M = 0.05
@@ -22,11 +21,10 @@ class Projection:
     def __init__(self, gaussians: GaussianMap, camera: Camera, T_cw: NDArray[np.float64]) -> None:
         x = transform_points(T_cw, gaussians.host("mean"))
         self.z = np.maximum(x[:, 2], 1e-3)  # [N] m
-        self.exact_u = camera.fx * x[:, 0] / self.z + camera.cx  # [N] px
-        self.exact_v = camera.fy * x[:, 1] / self.z + camera.cy  # [N] px
+        self.exact_u, self.exact_v = camera.project(x)  # [N] px
         u, v = np.rint(self.exact_u), np.rint(self.exact_v)
         self.ahead = x[:, 2] > _NEAR_M  # [N]
-        self.inside = self.ahead & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)  # [N]
+        self.inside = self.ahead & camera.holds(u, v)  # [N]
         self.u, self.v = u[self.inside].astype(int), v[self.inside].astype(int)  # [inside] px
         self._camera, self._T_cw = camera, T_cw
 
@@ -69,9 +67,16 @@ def _in_view(pixel: NDArray[np.float64], centre: float, focal: float, size: int)
 class Surface(Projection):
     """Which Gaussians a keyframe's depth supports, and which it sees through."""
 
-    def __init__(self, keyframe: Keyframe, camera: Camera, gaussians: GaussianMap, margin_per_m2: float) -> None:
-        super().__init__(gaussians, camera, keyframe.T_cw)
-        depth_m = keyframe.depth_m()
+    def __init__(
+        self,
+        depth_m: NDArray[np.float32],
+        T_cw: NDArray[np.float64],
+        camera: Camera,
+        gaussians: GaussianMap,
+        margin_per_m2: float,
+    ) -> None:
+        """depth_m: [H, W] m, measured at T_cw [4, 4]. margin_per_m2: how far a Gaussian may be off, times depth^2."""
+        super().__init__(gaussians, camera, T_cw)
         # The nearest measurement around decides, so that an edge pixel off by one does not speak against a surface
         nearest = cv2.erode(np.where(depth_m > 0, depth_m, np.inf), np.ones((3, 3)), borderValue=np.inf)
         surface = np.full(len(self.z), np.inf)

@@ -1,4 +1,4 @@
-"""Adam over named parameter arrays whose rows come and go with the map."""
+"""Adam over named parameter arrays; what it remembers of their rows stays with the rows."""
 
 from __future__ import annotations
 
@@ -12,22 +12,20 @@ from tgslam.device.arrays import require
 from tgslam.kernels import adam as kernels
 
 _MAX_CORRECTIONS = 1 << 15
-_MIN_CAPACITY = 64
 
 
 class Adam:
     """Adam with a learning rate per group; all groups have the same rows.
 
     Only visible rows change. Each row has its own count of updates for the bias correction, so a row that is seen
-    seldom, or was added late, takes the same first steps as any other. Moments live on the device with spare capacity
-    that doubles when rows are appended.
+    seldom, or was added late, takes the same first steps as any other. Moments and counts belong to the caller, who
+    keeps them with the rows: a row of zeros has no history.
     """
 
     def __init__(
         self,
         channels: dict[str, int],
         learning_rates: dict[str, float],
-        rows: int = 0,
         betas: tuple[float, float] = (0.9, 0.999),
         epsilon: float = 1e-15,
     ) -> None:
@@ -42,98 +40,56 @@ class Adam:
             raise ValueError(f"at most {kernels.GROUPS} groups, but got {sorted(channels)}")
         self.learning_rates = dict(learning_rates)
         self._channels = dict(channels)
-        self._first_column, self._columns = _columns(channels)
+        self._first_column, self.moment_width = _columns(channels)
         self._gains, self._epsilon = (1.0 - betas[0], 1.0 - betas[1]), epsilon
-        self._rows = rows
         self._correction = runtime.to_device(_corrections(*betas))
-        self._allocate(max(rows, _MIN_CAPACITY))
 
-    @property
-    def rows(self) -> int:
-        """Rows in use."""
-        return self._rows
-
-    def moments(self, group: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Host views or copies of the first and second moment of a group, [rows] or [rows, C]."""
+    def moments_of(self, group: str, moments: np.ndarray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """First and second moment of a group on the host, [N] or [N, C], out of those of all groups."""
         channels = self._channels[group]
         first, middle, end = (self._first_column[group] + k * max(channels, 1) for k in range(3))
-        host = runtime.to_host(self._moments)[: self._rows]
+        host = runtime.to_host(moments)
         m, v = host[:, first:middle], host[:, middle:end]
         return (m, v) if channels else (m[:, 0], v[:, 0])
 
-    def step_counts(self) -> NDArray[np.int32]:
-        """Updates that each row has had, [rows]."""
-        return runtime.to_host(self._steps)[: self._rows]
-
     def step(
         self,
+        rows: int,
         parameters: dict[str, np.ndarray],
         gradients: dict[str, np.ndarray],
-        visible: np.ndarray | None = None,
+        moments: np.ndarray,
+        steps: np.ndarray,
+        visible: np.ndarray,
         pace: float = 1.0,
     ) -> None:
-        """Update float32 [N] or [N, C] parameters in place from gradients of that shape; N may exceed `rows`.
+        """Update the first `rows` rows of float32 [N] or [N, C] parameters in place, from gradients of that shape.
 
-        visible: int32 [N], 0 = leave the row and its moments alone; by default every row is updated. pace:
-        what all learning rates are multiplied by. Groups that are not in `parameters` rest. Raises ValueError for
-        unknown groups, other shapes or dtypes.
+        moments: float32 [N, moment_width] and steps: int32 [N], changed too. visible: int32 [N], 0 = leave the row and
+        its moments alone. pace: what all learning rates are multiplied by. Groups that are not in `parameters` rest.
+        Raises ValueError for unknown groups, other shapes or dtypes.
         """
         for group in parameters:
             if group not in self._channels:
                 raise ValueError(f"unknown group {group!r}: the optimiser has {sorted(self._channels)}")
-            shape = self._shape(group, self._rows)
+            shape = self._shape(group, rows)
             require(f"parameter {group!r}", parameters[group], shape, at_least=True)
             require(f"gradient {group!r}", gradients[group], shape, at_least=True)
-        if visible is None:
-            visible = self._all_visible
-        require("visible", visible, (self._rows,), np.int32, at_least=True)
+        require("moments", moments, (rows, self.moment_width), at_least=True)
+        require("steps", steps, (rows,), np.int32, at_least=True)
+        require("visible", visible, (rows,), np.int32, at_least=True)
         if not parameters:
             return
         arrays = [array for group in parameters for array in (gradients[group], parameters[group])]
         unused = kernels.GROUPS - len(parameters)
         kernels.adam_rows(
-            self._rows, [pace * self.learning_rates[group] for group in parameters] + [0.0] * unused,
-            *self._gains, self._epsilon, self._correction, visible, self._steps, self._moments,
+            rows, [pace * self.learning_rates[group] for group in parameters] + [0.0] * unused,
+            *self._gains, self._epsilon, self._correction, visible, steps, moments,
             *arrays, *arrays[:2] * unused, tuple((self._first_column[g], self._channels[g]) for g in parameters),
         )  # fmt: skip
-
-    def append(self, rows: int) -> None:
-        """Add rows with no history at the end."""
-        start, self._rows = self._rows, self._rows + rows
-        capacity = self._steps.shape[0]
-        if self._rows > capacity:
-            self._reallocate(np.arange(start), max(self._rows, 2 * capacity))
-
-    def keep(self, kept: NDArray[np.bool_] | NDArray[np.integer]) -> None:
-        """Keep these rows, as a mask [rows] or as indices in the new order, with their moments and step counts.
-
-        Raises ValueError if a mask has another length, IndexError if an index is out of range.
-        """
-        if kept.dtype == np.bool_:
-            rows = np.flatnonzero(require("kept", kept, (self._rows,), np.bool_))
-        else:
-            rows = kept.astype(np.int64)
-            if len(rows) and not (rows.min() >= 0 and rows.max() < self._rows):
-                raise IndexError(f"rows to keep must be in 0..{self._rows - 1}")
-        self._rows = len(rows)
-        self._reallocate(rows, self._steps.shape[0])
 
     def _shape(self, group: str, rows: int) -> tuple[int, ...]:
         channels = self._channels[group]
         return (rows, channels) if channels else (rows,)
-
-    def _allocate(self, capacity: int) -> None:
-        self._moments = runtime.zeros((capacity, self._columns))
-        self._steps = runtime.zeros((capacity,), np.int32)
-        self._all_visible = runtime.empty((capacity,), np.int32)
-        self._all_visible.fill(1)
-
-    def _reallocate(self, kept: NDArray[np.integer], capacity: int) -> None:
-        """New arrays that start with the rows `kept` of the old ones, the rest zero."""
-        old_moments, old_steps = self._moments, self._steps
-        self._allocate(capacity)
-        self._moments = _moved(old_moments, kept, self._moments)
-        self._steps = _moved(old_steps, kept, self._steps)
 
 
 def _columns(channels: dict[str, int]) -> tuple[dict[str, int], int]:
@@ -143,12 +99,6 @@ def _columns(channels: dict[str, int]) -> tuple[dict[str, int], int]:
         first[group] = columns
         columns += 2 * max(values, 1)
     return first, columns
-
-
-def _moved(old: np.ndarray, kept: NDArray[np.integer], new: np.ndarray) -> np.ndarray:
-    host = runtime.to_host(new)
-    host[: len(kept)] = runtime.to_host(old)[kept]
-    return runtime.to_device(host, host.dtype.type)
 
 
 def _corrections(beta1: float, beta2: float) -> NDArray[np.float32]:

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tgslam.config.map_settings import StructureConfig
+from tgslam.config.plane_settings import StructureConfig
 from tgslam.device import runtime
 from tgslam.device.arrays import require
 from tgslam.kernels import instance_field as kernels

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tgslam.config.map_settings import StructureConfig
+from tgslam.config.plane_settings import StructureConfig
 from tgslam.device import runtime
 from tgslam.device.arrays import require
 from tgslam.kernels import plane_regularisers as kernels

@@ -36,7 +36,8 @@ class FrameLog:
 
 def to_json(report: FrameReport) -> str:
     """A frame report as one line of JSON; what is not finite becomes null."""
-    return json.dumps(plain({**vars(report), "status": report.status.value}), allow_nan=False)
+    fields = {name: value for name, value in vars(report).items() if name != "T_wc"}  # the trajectory has the poses
+    return json.dumps(plain({**fields, "status": report.status.value}), allow_nan=False)
 
 
 def read_log(path: Path) -> list[FrameReport]:

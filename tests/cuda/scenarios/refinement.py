@@ -7,13 +7,15 @@ import numpy as np
 from tests.cuda.harness import scenario
 from tgslam.camera import Camera
 from tgslam.config.input_settings import SyntheticConfig
-from tgslam.config.map_settings import LossConfig, MappingConfig, StructureConfig
+from tgslam.config.map_settings import LossConfig, MappingConfig
+from tgslam.config.plane_settings import StructureConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.geometry import se3_exp
 from tgslam.map.gaussians import PARAMETERS, GaussianMap
-from tgslam.map.keyframe import Keyframe
+from tgslam.map.keyframes import Keyframe
 from tgslam.mapping.refinement import Refiner
 from tgslam.mapping.structure_terms import StructureTerms
+from tgslam.ops.vector_adam import VectorAdam
 from tgslam.planes.instances.plane_table import PlaneTable
 from tgslam.types import Exposure, Frame, Gaussians
 
@@ -50,9 +52,9 @@ def _see_planes(source: SyntheticSource, keyframe: Keyframe, gaussians: Gaussian
     T_wc, planes_w, camera = source.pose(0), source.planes(), source.camera
     offsets = planes_w[:, 3] + planes_w[:, :3] @ T_wc[:3, 3]
     local = np.column_stack([planes_w[:, :3] @ T_wc[:3, :3], offsets])
-    terms.set_planes(PlaneTable(local, np.arange(len(local), dtype=np.int32)))
+    terms.know(PlaneTable(local, np.arange(len(local), dtype=np.int32)), 1)
     labels = source.labels(0)
-    keyframe.plane_ids = labels.astype(np.int16)
+    keyframe.show(labels)
     mean = gaussians.host("mean")
     u = np.rint(camera.fx * mean[:, 0] / mean[:, 2] + camera.cx).astype(int)
     v = np.rint(camera.fy * mean[:, 1] / mean[:, 2] + camera.cy).astype(int)
@@ -69,16 +71,19 @@ def steps(optimizer: str = "relaxation", steps: int = 3, planes: bool = False) -
     frame = source.read(0)
     gaussians = GaussianMap.from_gaussians(_facing(frame, source.camera))
     structure = StructureConfig(pgi_interval=2) if planes else None
-    refiner = Refiner(source.camera, MappingConfig(optimizer=optimizer), LossConfig(), structure=structure)
-    refiner.append(gaussians.count)
+    refiner = Refiner(gaussians, source.camera, MappingConfig(optimizer=optimizer), LossConfig(), structure)
     pose = se3_exp([0.002, -0.001, 0.001, 0.003, 0.002, -0.004])
-    keyframe = Keyframe.from_frame(frame, pose, Exposure(1.1, 0.02), np.eye(6))
+    keyframe, adam = Keyframe(frame, pose, Exposure(1.1, 0.02), np.eye(6)), VectorAdam([0.0003] * 6)
     if refiner.structure:
         _see_planes(source, keyframe, gaussians, refiner.structure)
-    values = [refiner.step(gaussians, keyframe, move_pose=True).value for _ in range(steps)]
+    values = []
+    for _ in range(steps):
+        found = refiner.step(keyframe, pose)
+        values.append(found.loss.value)
+        pose = se3_exp(adam.step(found.g_pose)) @ pose
     return {name: gaussians.host(name).copy() for name in PARAMETERS} | {
-        "pose": keyframe.T_cw,
+        "pose": pose,
         "values": np.array(values),
-        "contribution": refiner.contribution.copy(),
-        "views": refiner.views.copy(),
+        "contribution": gaussians.host("contribution").copy(),
+        "views": gaussians.host("views").copy(),
     }

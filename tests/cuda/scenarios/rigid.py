@@ -6,7 +6,7 @@ import numpy as np
 
 from tests.cuda.harness import scenario
 from tgslam.geometry import se3_exp
-from tgslam.map.gaussians import GaussianMap
+from tgslam.map.gaussians import CARRIERS, GaussianMap
 from tgslam.types import Gaussians
 
 
@@ -14,7 +14,8 @@ from tgslam.types import Gaussians
 def rows(count: int = 300, keyframes: int = 5) -> dict[str, np.ndarray]:
     """Random rows after means of random motions."""
     rng = np.random.default_rng(0)
-    moved = GaussianMap.from_gaussians(
+    moved = GaussianMap()
+    moved.append(
         Gaussians(
             mean=rng.normal(size=(count, 3)).astype(np.float32),
             log_scale=np.zeros((count, 3), np.float32),
@@ -24,8 +25,8 @@ def rows(count: int = 300, keyframes: int = 5) -> dict[str, np.ndarray]:
             embedding=np.zeros((count, 3), np.float32),
             plane_id=np.full(count, -1, np.int32),
             birth_keyframe=np.zeros(count, np.int32),
-        )
+        ),
+        carriers=rng.integers(0, keyframes, (count, CARRIERS)).astype(np.int32),
     )
-    carriers = rng.integers(0, keyframes, (count, 3)).astype(np.int32)
-    moved.move(np.stack([se3_exp(rng.normal(size=6)) for _ in range(keyframes)]), carriers)
+    moved.move(np.stack([se3_exp(rng.normal(size=6)) for _ in range(keyframes)]))
     return {"mean": moved.host("mean").copy(), "quat_wxyz": moved.host("quat_wxyz").copy()}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tgslam.bench.workloads import back_projected
 from tgslam.camera import Camera
 from tgslam.config.input_settings import SyntheticConfig
-from tgslam.config.map_settings import StructureConfig
+from tgslam.config.plane_settings import StructureConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.device import runtime
 from tgslam.map.gaussians import GaussianMap

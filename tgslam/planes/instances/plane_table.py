@@ -24,6 +24,10 @@ class PlaneTable:
     def __len__(self) -> int:
         return len(self.ids)
 
+    def resolved(self, ids: NDArray[np.int32]) -> NDArray[np.int32]:
+        """The ids [...] under which they live on; -1 stays -1."""
+        return np.append(self.ids, np.int32(NO_ID))[ids]
+
     @classmethod
     def empty(cls) -> PlaneTable:
         """No planes."""

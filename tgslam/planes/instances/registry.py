@@ -7,15 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.camera import Camera
+from tgslam.camera import Camera, SensorNoise
 from tgslam.config.plane_settings import PlanesConfig
-from tgslam.geometry import inverse
 from tgslam.planes.estimate import PlaneEstimate
 from tgslam.planes.instances.directions import stands_as_known
 from tgslam.planes.instances.instance import NO_ID, PlanarInstance, Poses
 from tgslam.planes.instances.joining import Joining
 from tgslam.planes.instances.known_steps import with_known_steps
 from tgslam.planes.instances.matching import LEAST_SAMPLES, ViewMatching
+from tgslam.planes.instances.plane_table import PlaneTable
 from tgslam.planes.instances.sight import Samples, Sight, Tolerance
 from tgslam.planes.instances.unevenness import is_part
 from tgslam.planes.segment import PlaneView
@@ -48,12 +48,14 @@ class PlaneRegistry:
     but the unevenness of a larger PGI goes by that one's id, and is kept so that later views find it again.
     """
 
-    def __init__(self, config: PlanesConfig, depth_sigma_per_m2: float) -> None:
-        """depth_sigma_per_m2: the sensor's noise, sigma_z = this * z^2."""
+    def __init__(self, config: PlanesConfig, noise: SensorNoise, poses: Poses) -> None:
+        """poses: keyframe -> T_wc [4, 4], kept by somebody else."""
+        depth_sigma_per_m2 = noise.per_m2
         self._config = config
+        self.version = 0
         self._tolerance = Tolerance(config.gate_sigmas, depth_sigma_per_m2, config.pose_sigma_rad, config.pose_sigma_m)
         self._instances: list[PlanarInstance] = []  # candidates included, oldest first
-        self._poses: dict[int, NDArray[np.float64]] = {}  # keyframe -> T_wc [4, 4]
+        self._poses = poses
         self._absorbed_by: dict[int, int] = {}
         self._joining = Joining(config, self._tolerance)
         self._next_id = 0
@@ -109,7 +111,7 @@ class PlaneRegistry:
 
         depth_m: [H, W] m on the host, as the view was made from. keyframe: a number that grows from call to call.
         """
-        self._poses[keyframe] = inverse(T_cw)
+        self.version += 1
         samples = Samples.of(view, depth_m, camera, T_cw, self._config.mask_width_px)
         matching = ViewMatching(samples, self._instances, self._config, self._tolerance)
         corrected = self._match(matching, keyframe)
@@ -122,14 +124,17 @@ class PlaneRegistry:
         shrunk = tuple(sorted({instance.id for instance in corrected if instance.id != NO_ID}))
         return Observation(keyframe, np.array(ids, np.int32), tuple(created), tuple(merged), tuple(removed), shrunk)
 
-    def moved(self, corrections: Poses) -> tuple[tuple[int, int], ...]:
+    @property
+    def table(self) -> PlaneTable:
+        """The planes as they are now, by every id that was ever given."""
+        return PlaneTable.of(self, self.id_count)
+
+    def follow(self, corrections: Poses) -> tuple[tuple[int, int], ...]:
         """Keyframes have moved in the world: p_w <- corrections[keyframe] p_w, [4, 4] each; the others stay.
 
         PGIs are computed again from their keyframes' views. Returns merges (kept, absorbed) of those that now coincide.
         """
-        for keyframe, correction in corrections.items():
-            if keyframe in self._poses:
-                self._poses[keyframe] = correction @ self._poses[keyframe]
+        self.version += 1
         affected = [i for i in self._instances if any(k in corrections for k in i.keyframes)]
         for instance in affected:
             instance.move(corrections, self._poses)

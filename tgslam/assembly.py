@@ -1,0 +1,33 @@
+"""The parts of the system that a config may leave out, imported only where they are used."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tgslam.camera import Camera
+from tgslam.config.schema import Config
+from tgslam.errors import ConfigError
+
+if TYPE_CHECKING:
+    from tgslam.graph.closing import GraphClosing
+    from tgslam.mapping.plane_observation import PlaneObserver
+
+
+def plane_observer(camera: Camera, config: Config) -> PlaneObserver | None:
+    """What looks for planes, None = nothing does. Its import takes 0.3 s, for SciPy."""
+    if not config.planes.enabled:
+        return None
+    from tgslam.mapping.plane_observation import PlaneObserver
+
+    return PlaneObserver(camera, config.planes, config.loss.noise)
+
+
+def graph_closing(camera: Camera, config: Config) -> GraphClosing | None:
+    """The pose graph with its closures, None = there is none. Raises ConfigError for closures without planes."""
+    if not (config.closures.enabled or config.loops.enabled):
+        return None
+    if config.closures.enabled and not config.planes.enabled:
+        raise ConfigError("closures.enabled needs planes: set planes.enabled=true as well")
+    from tgslam.graph.closing import GraphClosing
+
+    return GraphClosing(camera, config.loss.depth_sigma_per_m2, config.closures, config.loops)

@@ -1,0 +1,94 @@
+"""Tracking as the system uses it: prediction, solver and recovery, and what the solver is to know of the map."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tgslam.camera import Camera
+from tgslam.config.map_settings import LossConfig
+from tgslam.config.tracking_settings import TrackingConfig
+from tgslam.geometry import inverse
+from tgslam.map.keyframes import Keyframe
+from tgslam.map.world import Map
+from tgslam.tracking.brightness import relative_gain
+from tgslam.tracking.motion import MotionFilter
+from tgslam.tracking.reference import Reference, references_of
+from tgslam.tracking.result import TrackingResult
+from tgslam.tracking.solver import make_tracker, track_or_recover
+from tgslam.tracking.steadying import planes_seen, steadying_planes
+from tgslam.types import Exposure, Frame, Matrix4
+
+_FALLBACKS = 3  # latest keyframes from which a lost camera is sought
+
+
+class FrontEnd:
+    """Finds each frame's pose against the map."""
+
+    def __init__(self, camera: Camera, config: TrackingConfig, loss: LossConfig) -> None:
+        self.tracker = make_tracker(camera, config, loss)
+        self._camera, self._config = camera, config
+        self._motion = MotionFilter(config)
+        self._exposure = Exposure()
+
+    def track(self, frame: Frame, world: Map, latest_T_cw: Matrix4) -> TrackingResult:
+        """The frame's pose, from where motion leads; if that is lost, from the last frame at T_cw [4, 4] or from the
+        latest keyframes.
+        """
+        predicted, prior = self._motion.predict(frame.timestamp_s), self._motion.information(frame.timestamp_s)
+        fallbacks = [latest_T_cw, *(keyframe.T_cw for keyframe in world.keyframes[: -_FALLBACKS - 1 : -1])]
+        return track_or_recover(self.tracker, frame, world.gaussians, predicted, fallbacks, self._exposure, prior)
+
+    def tracked_view(self, world: Map) -> NDArray[np.bool_]:
+        """[N] Gaussians in view of the last frame, as of the rendering that it was aligned to."""
+        return self.tracker.rasterizer.visible(world.gaussians.count)
+
+    def keyframe(self, frame: Frame, result: TrackingResult, world: Map) -> Keyframe:
+        """Add the tracked frame to the map's keyframes, as bright as the keyframe before shows the same surfaces."""
+        keyframes = world.keyframes
+        keyframe = Keyframe(frame, result.T_cw, result.exposure, result.information)
+        number = keyframes.add(keyframe)
+        if number and self._config.exposure == "gain":
+            previous = keyframes[number - 1]
+            T_pk = previous.T_cw @ inverse(keyframe.T_cw)
+            gain = relative_gain(keyframes.images(number), keyframes.images(number - 1), T_pk, self._camera)
+            if gain is not None:
+                keyframe.expose(Exposure(gain * previous.exposure.gain))
+        return keyframe
+
+    def know(self, world: Map) -> NDArray[np.bool_]:
+        """The map has changed: the next frames are aligned to it as it is now, and to keyframes' own images.
+
+        Returns [N] the Gaussians in view of the latest keyframe.
+        """
+        latest = len(world.keyframes) - 1
+        self.tracker.rasterizer.forward(world.gaussians, world.keyframes[latest].T_cw)
+        seen = self.tracker.rasterizer.visible(world.gaussians.count)
+        self.tracker.know(planes_seen(world, latest), self._references(world))
+        return seen
+
+    def follow(self, frame: Frame, result: TrackingResult, T_cw: Matrix4) -> None:
+        """The motion model follows the pose as mapping has left it, T_cw [4, 4]; a lost camera is believed to slow
+        down.
+        """
+        if result.lost:
+            self._motion.coast(frame.timestamp_s, T_cw)
+        else:
+            self._motion.update(frame.timestamp_s, T_cw, result.information)
+            self._exposure = result.exposure
+
+    def move(self, motion: Matrix4) -> None:
+        """The world around the camera has moved, p_w <- motion p_w [4, 4]."""
+        self._motion.move(motion)
+
+    def _references(self, world: Map) -> list[Reference]:
+        keyframes = world.keyframes
+        depth_m = keyframes.images(len(keyframes) - 1).depth_m
+        median_m = float(np.median(depth_m[depth_m > 0])) if depth_m.any() else 0.0
+        chosen = references_of(keyframes.T_cw(), median_m, self._config.references)
+        return [self._reference(world, number) for number in chosen]
+
+    def _reference(self, world: Map, number: int) -> Reference:
+        keyframe, images = world.keyframes[number], world.keyframes.images(number)
+        planes_c = steadying_planes(world, number)
+        return Reference(images.colour, images.depth_m, keyframe.T_cw, keyframe.exposure, planes_c)
