@@ -31,7 +31,9 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     found = blocks(args.file.read_text(encoding="utf-8"), args.language)
     if not 1 <= args.number <= len(found):
-        print(f"{args.file}: has {len(found)} {args.language} blocks, so none has number {args.number}", file=sys.stderr)
+        print(
+            f"{args.file}: has {len(found)} {args.language} blocks, so none has number {args.number}", file=sys.stderr
+        )
         return 1
     print(found[args.number - 1], end="")
     return 0
