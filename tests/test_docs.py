@@ -10,7 +10,10 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
+from tests.test_layers import RANKS
+from tgslam import __version__
 from tools import markdown_block
 
 CHECKOUT = Path(__file__).resolve().parents[1]
@@ -115,6 +118,23 @@ def test_no_other_equation_is_in_the_table() -> None:
 def test_the_total_objective_is_stated_in_one_place() -> None:
     stated = [page.name for page in PAGES if "lambda_pgi E_pgi + lambda_pho E_pho" in page.read_text(encoding="utf-8")]
     assert stated == ["paper.md"]
+
+
+def test_the_page_on_architecture_has_every_part_in_its_row() -> None:
+    text = (CHECKOUT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    rows: dict[int, set[str]] = {}
+    for number, parts in re.findall(r"^\| (\d+) \| ([^|]+) \|", text, flags=re.MULTILINE):
+        rows.setdefault(int(number), set()).update(re.findall(r"`(\w+)`", parts))
+    assert rows == dict(enumerate((rank for rank in RANKS if rank != {"__main__"}), start=1))
+
+
+def test_the_citation_names_the_software_and_the_paper() -> None:
+    citation = yaml.safe_load((CHECKOUT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert {"cff-version", "message", "title", "authors"} <= set(citation)
+    assert citation["version"] == __version__
+    (paper,) = citation["references"]
+    assert {"authors", "title", "type"} <= set(paper)
+    assert all(author["family-names"] in README.read_text(encoding="utf-8") for author in paper["authors"])
 
 
 def test_ci_takes_its_commands_from_the_readme() -> None:
