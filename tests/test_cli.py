@@ -351,6 +351,28 @@ def test_render_shows_the_planes_of_the_keyframes(world: World, capsys: pytest.C
     assert "no planes" in one_error_line(capsys)
 
 
+def test_render_makes_one_picture_of_a_run(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "--output", "out", "--frames", "3:"]) == 0
+    assert main(["render", "out", "--overview"]) == 0
+    folder = Path("out/render-overview")
+    assert {path.name for path in folder.iterdir()} == {"overview.png", "poses.txt"}
+    shown = read_trajectory(folder / "poses.txt")
+    np.testing.assert_allclose(shown.T_wc, read_trajectory(Path("out/keyframes.txt")).T_wc[:1])
+    image = cv2.imread(str(folder / "overview.png"))
+    height, width = image.shape[:2]
+    for row, column, value in ((height // 4, width // 4, 128), (height // 4, 3 * width // 4, 153)):
+        np.testing.assert_allclose(image[row, column], value, atol=3)  # the source's grey, and the renderer's
+    np.testing.assert_allclose(image[3 * height // 4, width // 8], (np.array([0, 127.5, 255]) + 153) / 2, atol=3)
+    assert main(["render", "out", "--overview"]) == 1
+    world.source.bad = (3,)
+    capsys.readouterr()
+    assert main(["render", "out", "--overview", "--overwrite"]) == 1
+    assert "frame 3 is truncated" in one_error_line(capsys)
+    (Path("out") / "planes.json").unlink()
+    assert main(["render", "out", "--overview", "--overwrite"]) == 1
+    assert "no planes" in one_error_line(capsys)
+
+
 def test_an_orbit_keeps_looking_at_one_point(world: World) -> None:
     assert main(["run", "--output", "out"]) == 0
     assert main(["render", "out", "--orbit", "--count", "8", "--output", "orbit"]) == 0

@@ -27,7 +27,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
     for name in FOLDERS:
         shutil.copytree(CHECKOUT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md"):
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(CHECKOUT / name, folder)
     pip = (sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--no-index", "-w", "dist", ".")
     done = run(*pip, cwd=folder)
@@ -89,3 +89,6 @@ def test_the_metadata_names_the_command_and_the_python(wheel: Path) -> None:
     text = archive.read(metadata).decode()
     assert "Requires-Python: <3.14,>=3.11" in text
     assert "Requires-Dist: taichi==" in text
+    assert "License-Expression: MIT" in text
+    assert "Author: tgslam contributors" in text
+    assert any(name.endswith("licenses/LICENSE") for name in archive.namelist())

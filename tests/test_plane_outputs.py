@@ -15,7 +15,9 @@ from hypothesis import strategies as st
 from plyfile import PlyData
 
 from tgslam.errors import OutputError
+from tgslam.output import overview
 from tgslam.output.floorplan import IMAGE_UP_W, up_direction, wall_lines, write_floorplan
+from tgslam.output.overview import Overview, draw_overview
 from tgslam.output.plane_colours import in_plane_colours
 from tgslam.output.plane_overlay import plane_overlay
 from tgslam.output.planes_io import read_planes, write_planes
@@ -315,3 +317,60 @@ def test_the_overlay_blends_colours_and_lists_what_is_there() -> None:
     assert not np.isclose(legend, np.float32(ROOM[1].colour), atol=STEP).all(axis=-1).any()
     empty = plane_overlay(colour, np.full_like(ids, -1), ROOM)
     np.testing.assert_allclose(empty[:, :160], colour, atol=STEP)
+
+
+def an_overview(planes: list[Plane], width: int = 160, height: int = 120) -> Overview:
+    ids = np.full((height, width), -1, np.int32)
+    ids[height // 4 : height // 2, width // 4 : width // 2] = 3
+    return Overview(
+        title="input",
+        colour=np.full((height, width, 3), 0.25, np.float32),
+        rendering=np.full((height, width, 3), 1.5, np.float32),
+        ids=ids,
+        planes=planes,
+        T_wc=np.eye(4),
+        centres_w=np.array([[0.0, 0, 0], [0, 0, 1], [1, 0, 2]]),
+        half_width=0.7,
+    )
+
+
+def panels(picture: np.ndarray) -> list[np.ndarray]:
+    """The four panels: 10 px lie between them and round them, and 26 above them for captions."""
+    height, width = picture.shape[0] // 2 - 36, (picture.shape[1] - 30) // 2
+    corners = [(26 + y, 10 + x) for y in (0, height + 36) for x in (0, width + 10)]
+    return [picture[top : top + height, left : left + width] for top, left in corners]
+
+
+@pytest.mark.parametrize(("width", "height"), [(160, 120), (1280, 960)])
+def test_the_overview_has_input_rendering_planes_and_floor_plan(width: int, height: int) -> None:
+    picture = draw_overview(an_overview(ROOM, width, height))
+    assert picture.dtype == np.float32
+    assert 0 <= picture.min() <= picture.max() <= 1
+    given_image, rendering, planes, plan = panels(picture)
+    np.testing.assert_allclose(given_image, 0.25, atol=0.02)
+    np.testing.assert_array_equal(rendering, 1)
+    rows, columns = planes.shape[:2]
+    blended = 0.5 + 0.5 * np.array(ROOM[0].colour)
+    np.testing.assert_allclose(planes[int(0.27 * rows), int(0.27 * columns)], blended, atol=0.02)
+    np.testing.assert_array_equal(planes[int(0.6 * rows) :], 1)
+    for wall_plane in (ROOM[0], ROOM[1]):
+        assert np.isclose(plan, np.float32(wall_plane.colour), atol=0.02).all(axis=-1).sum() > 200
+    red = (plan[..., 0] > 0.7) & (plan[..., 1] < 0.2) & (plan[..., 2] < 0.2)
+    assert red.sum() > 50  # the path
+
+
+def test_the_overview_of_a_camera_that_stands_still_before_a_floor() -> None:
+    view = replace(an_overview([FLOOR]), centres_w=np.zeros((1, 3)))
+    plan = panels(draw_overview(view))[3]
+    rows, columns = np.nonzero((plan[..., 0] > 0.7) & (plan[..., 1] < 0.2))
+    assert len(rows) > 20  # a dot
+    assert abs(float(columns.mean()) - plan.shape[1] / 2) < 2
+    assert abs(float(rows.mean()) - plan.shape[0] / 2) < 20
+
+
+def test_ids_on_the_floor_plan_never_stand_on_one_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    printed: list[tuple[str, tuple[int, int]]] = []
+    monkeypatch.setattr(overview, "print_text", lambda image, text, middle, scale: printed.append((text, middle)))
+    draw_overview(an_overview([wall(id_, (-2.0, 4.0), (2.0, 4.0)) for id_ in range(40, 49)]))
+    assert [text for text, _ in printed] == ["40", "41", "42", "43", "44"]  # as many as there are places
+    assert len({middle for _, middle in printed}) == 5

@@ -1,4 +1,4 @@
-"""`tgslam render`: a run's map seen along a trajectory, from its keyframes, or on a swing round what it saw first."""
+"""`tgslam render`: a run's map seen along a trajectory, from its keyframes, or on a swing; or one picture of it all."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ from typing import Any
 import numpy as np
 
 from tgslam.cli import engine
+from tgslam.cli.inputs import open_frames
 from tgslam.errors import OutputError
 from tgslam.evaluation.plane_metrics import ReadIds
 from tgslam.evaluation.protocol import Render
 from tgslam.geometry import inverse, se3_exp, transform_points
+from tgslam.output.log import read_log
+from tgslam.output.overview import Overview, draw_overview
 from tgslam.output.pictures import write_colour, write_depth, write_depth_colours
 from tgslam.output.plane_overlay import plane_overlay
 from tgslam.output.planes_io import read_planes
 from tgslam.output.ply import read_map
 from tgslam.output.run_folder import RunFolder
 from tgslam.output.trajectory_io import read_trajectory, write_trajectory
-from tgslam.types import Gaussians, Matrix4, Plane, Trajectory
+from tgslam.types import Frame, Gaussians, Matrix4, Plane, Trajectory
 
 _log = logging.getLogger(__name__)
 _ORBIT_YAW_RAD = np.deg2rad(20.0)
@@ -35,13 +38,15 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
         "render",
         help="render images of a run's map",
         description="Write colour/, depth/ (16-bit PNG, 5000 units a metre, 0 = none) and depth_colours/, "
-        "one PNG a pose, and the poses themselves in poses.txt; with --planes, planes/ instead of those.",
+        "one PNG a pose, and the poses themselves in poses.txt; with --planes, planes/ instead of those; "
+        "with --overview, overview.png.",
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--trajectory", type=Path, metavar="FILE", help="camera-to-world poses as TUM text")
     what.add_argument("--keyframes", action="store_true", help="the run's keyframes")
     what.add_argument("--planes", action="store_true", help="the run's keyframes with the planes that the map shows")
+    what.add_argument("--overview", action="store_true", help="one picture: input, rendering, planes and floor plan")
     what.add_argument("--orbit", action="store_true", help="a closed swing round what the first keyframe looks at")
     parser.add_argument("--count", type=_positive, default=60, metavar="N", help="poses of --orbit (default: 60)")
     parser.add_argument("--output", type=Path, metavar="DIR", help="folder (default: RUN/render-...)")
@@ -55,20 +60,22 @@ def execute(args: argparse.Namespace) -> int:
     folder = RunFolder.open(args.run)
     camera = folder.read_record().camera
     gaussians = read_map(folder.map)
-    planes = _planes(folder) if args.planes else ()
+    planes = _planes(folder) if args.planes or args.overview else ()
     name, poses = _poses(args, folder, gaussians)
     output = args.output or folder.path / f"render-{name}"
     if output.exists() and (not output.is_dir() or any(output.iterdir())) and not args.overwrite:
         raise OutputError(f"{output}: is there already; choose another --output, or add --overwrite")
     engine.start_device(args.device)
     render = engine.make_render(camera)
-    if args.planes:
+    if args.overview:
+        poses = _write_overview(output, folder, gaussians, planes, poses, render)
+    elif args.planes:
         read_ids = engine.make_read_ids(camera, planes, folder.read_config())
         _write_plane_images(output, gaussians, poses, render, read_ids, planes)
     else:
         _write_map_images(output, gaussians, poses, render)
     write_trajectory(output / "poses.txt", poses)
-    _log.info("%d images of each kind are in %s", len(poses), output)
+    _log.info("%d image%s of each kind %s in %s", len(poses), *(("s", "are") if len(poses) > 1 else ("", "is")), output)
     return 0
 
 
@@ -99,6 +106,45 @@ def _write_plane_images(
         write_colour(output / "planes" / f"{number:06d}.png", image)
 
 
+def _write_overview(
+    output: Path,
+    folder: RunFolder,
+    gaussians: Gaussians,
+    planes: tuple[Plane, ...],
+    keyframes: Trajectory,
+    render: Render,
+) -> Trajectory:
+    """Write overview.png at the keyframe that shows most planes, the first of equals, and return its pose."""
+    record, config = folder.read_record(), folder.read_config()
+    number = max(range(len(keyframes)), key=lambda k: sum(k in plane.keyframes for plane in planes))
+    frame = _keyframe_image(folder, number)
+    T_wc = keyframes.T_wc[number]
+    read_ids = engine.make_read_ids(record.camera, planes, config)
+    view = Overview(
+        title=f"input: keyframe {number} (frame {frame.index})",
+        colour=frame.colour,
+        rendering=render(gaussians, inverse(T_wc)).colour,
+        ids=read_ids(gaussians, inverse(T_wc)),
+        planes=planes,
+        T_wc=T_wc,
+        centres_w=read_trajectory(folder.trajectory).T_wc[:, :3, 3],
+        half_width=0.5 * record.camera.width / record.camera.fx,
+    )
+    output.mkdir(parents=True, exist_ok=True)
+    write_colour(output / "overview.png", draw_overview(view), small=True)
+    return Trajectory(keyframes.timestamps_s[number : number + 1], keyframes.T_wc[number : number + 1])
+
+
+def _keyframe_image(folder: RunFolder, number: int) -> Frame:
+    """The input of a keyframe. Raises what opening the input of the run and reading from it raise."""
+    record = folder.read_record()
+    positions = [position for position, report in enumerate(read_log(folder.log)) if report.is_keyframe]
+    if number >= len(positions):
+        raise OutputError(f"{folder.log}: names {len(positions)} keyframes, fewer than {folder.keyframes.name}")
+    source = open_frames(folder.read_config(), None if record.input is None else Path(record.input), record.frames)
+    return source.read(positions[number])
+
+
 def orbit(gaussians: Gaussians, T_wc: Matrix4, count: int) -> Trajectory:
     """Poses on a closed curve round the point straight ahead of `T_wc`, at the median depth of the Gaussians before it.
 
@@ -123,7 +169,8 @@ def _poses(args: argparse.Namespace, folder: RunFolder, gaussians: Gaussians) ->
     if args.trajectory is not None:
         name, path = args.trajectory.stem, args.trajectory
     else:
-        name, path = "orbit" if args.orbit else "planes" if args.planes else "keyframes", folder.keyframes
+        modes = ("orbit", "planes", "overview", "keyframes")
+        name, path = next(mode for mode in modes if getattr(args, mode)), folder.keyframes
     poses = read_trajectory(path)
     if not len(poses):
         raise OutputError(f"{path}: holds no pose")

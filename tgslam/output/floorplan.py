@@ -75,6 +75,16 @@ def wall_lines(planes: Sequence[Plane], up_w: Vector) -> list[WallLine]:
     return lines
 
 
+def plan_points(points_w: Vector, up_w: Vector) -> Vector:
+    """World points [N, 3] m in the plan's axes [N, 2] m."""
+    return np.asarray(points_w @ _plan_axes(up_w).T)
+
+
+def scale_bar_m(most_m: float) -> float:
+    """The longest round length that is no longer than `most_m`."""
+    return max((length for length in _BAR_LENGTHS_M if length <= most_m), default=_BAR_LENGTHS_M[0])
+
+
 def write_floorplan(path: Path, planes: Sequence[Plane]) -> None:
     """Write the plan; without upright planes it has nothing but its scale bar. Raises OSError."""
     lines = wall_lines(planes, up_direction(planes))
@@ -130,8 +140,7 @@ def _draw_id(svg: ElementTree.Element, line: WallLine, low: Vector, high: Vector
 
 
 def _draw_scale_bar(svg: ElementTree.Element, width: float, height: float) -> None:
-    fitting = [length for length in _BAR_LENGTHS_M if length * _PX_PER_M <= _BAR_SHARE * width]
-    length_m = fitting[-1] if fitting else _BAR_LENGTHS_M[0]
+    length_m = scale_bar_m(_BAR_SHARE * width / _PX_PER_M)
     left, y = 0.2 * _PX_PER_M, height - 0.15 * _PX_PER_M
     right = left + length_m * _PX_PER_M
     path = f"M{left:.1f} {y - 5:.1f} V{y:.1f} H{right:.1f} V{y - 5:.1f}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -15,10 +16,13 @@ from tgslam.types import FloatImage
 DEPTH_SCALE = 5000.0  # units of a depth PNG per metre, as in the TUM RGB-D benchmark
 
 
-def write_colour(path: Path, colour: FloatImage) -> None:
-    """Write RGB [H, W, 3] in [0, 1] as an 8-bit PNG; values outside are clipped. Raises OSError."""
+def write_colour(path: Path, colour: FloatImage, small: bool = False) -> None:
+    """Write RGB [H, W, 3] in [0, 1] as an 8-bit PNG; values outside are clipped. Raises OSError.
+
+    small: take longer for a smaller file.
+    """
     rgb = np.round(np.clip(colour, 0.0, 1.0) * 255.0).astype(np.uint8)
-    _write_png(path, rgb[..., ::-1])
+    _write_png(path, rgb[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9] if small else [])
 
 
 def write_depth(path: Path, depth_m: FloatImage) -> None:
@@ -37,8 +41,8 @@ def write_depth_colours(path: Path, depth_m: FloatImage, far_m: float) -> None:
     _write_png(path, np.where((depth_m > 0)[..., None], bgr, np.uint8(0)).astype(np.uint8))
 
 
-def _write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
-    ok, data = cv2.imencode(".png", np.ascontiguousarray(image))
+def _write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16], options: Sequence[int] = ()) -> None:
+    ok, data = cv2.imencode(".png", np.ascontiguousarray(image), options)
     if not ok:
         raise OutputError(f"{path}: an image of shape {image.shape} cannot be written as PNG")
     with atomic_file(path) as file:
