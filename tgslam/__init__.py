@@ -1,10 +1,56 @@
-"""tgslam: Structure Gaussian Splatting SLAM for RGB-D video, on a CPU or with CUDA, through Taichi kernels."""
+"""tgslam: Structure Gaussian Splatting SLAM for RGB-D video, on a CPU or with CUDA, through Taichi kernels.
 
+The names below are what programs use; docs/python.md shows how. They are imported when they are first asked for.
+"""
+
+import importlib
 import importlib.util
+import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tgslam.camera import Camera
+    from tgslam.config.loader import load as load_config
+    from tgslam.config.schema import Config
+    from tgslam.errors import TgslamError
+    from tgslam.recording import Recording, open_recording
+    from tgslam.saving import save_run
+    from tgslam.slam import Slam
+    from tgslam.types import Frame, FrameReport, FrameStatus, Gaussians, Plane, Trajectory
 
 __version__ = "0.1.0"
+__all__ = [
+    "Camera",
+    "Config",
+    "Frame",
+    "FrameReport",
+    "FrameStatus",
+    "Gaussians",
+    "Plane",
+    "Recording",
+    "Slam",
+    "TgslamError",
+    "Trajectory",
+    "load_config",
+    "open_recording",
+    "save_run",
+]
+
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # stdout is the user's; read when taichi is imported
+
+_MODULES = {
+    "Camera": "camera",
+    "Config": "config.schema",
+    "Recording": "recording",
+    "Slam": "slam",
+    "TgslamError": "errors",
+    "load_config": "config.loader",
+    "open_recording": "recording",
+    "save_run": "saving",
+}  # of what is not in `types`
+_NAMES = {"load_config": "load"}  # there, where it differs
 
 
 def _import_from_checkout(name: str) -> None:
@@ -26,3 +72,18 @@ for _name in ("kernels", "configs"):
     if not (Path(__file__).parent / _name).exists():
         _import_from_checkout(_name)
 del _name
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from tgslam.device.quick_import import quick_import
+
+    with quick_import():
+        module = importlib.import_module(f"{__name__}.{_MODULES.get(name, 'types')}")
+    value = globals()[name] = getattr(module, _NAMES.get(name, name))
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -16,15 +16,16 @@ from tgslam.errors import FrameError, TrackingError
 from tgslam.output.log import FrameLog
 from tgslam.output.ply import write_map
 from tgslam.output.progress import FrameObserver
+from tgslam.output.results import Found, write_results
 from tgslam.output.run_folder import RunFolder
 from tgslam.output.trajectory_io import write_trajectory
-from tgslam.types import Frame, FrameReport, FrameStatus, Gaussians, Plane, Trajectory
+from tgslam.types import Frame, FrameReport, FrameStatus
 
 _log = logging.getLogger(__name__)
 _MAX_WARNINGS = 5  # skipped or lost frames that are named; log.jsonl has all
 
 
-class System(Protocol):
+class System(Found, Protocol):
     """What a run needs of the SLAM system."""
 
     def process_frame(self, frame: Frame) -> FrameReport:
@@ -32,18 +33,6 @@ class System(Protocol):
 
     def finish(self) -> None:
         """Refine the map once all frames are in."""
-
-    def trajectory(self) -> Trajectory:
-        """Camera-to-world poses of every frame that was not skipped."""
-
-    def keyframe_trajectory(self) -> Trajectory:
-        """Camera-to-world poses of the keyframes."""
-
-    def gaussians(self) -> Gaussians:
-        """The map."""
-
-    def planes(self) -> tuple[Plane, ...]:
-        """The persistent planes by id, empty when the system looks for none."""
 
 
 @dataclass(frozen=True)
@@ -82,11 +71,7 @@ def run(
             start_s = time.perf_counter()
             system.finish()
             summary = replace(summary, finish_s=time.perf_counter() - start_s)
-        write_trajectory(folder.trajectory, system.trajectory())
-        write_trajectory(folder.keyframes, system.keyframe_trajectory())
-        gaussians = system.gaussians()
-        folder.write_planes(system.planes(), gaussians)
-        write_map(folder.map, gaussians)
+        write_results(folder, system)
     except Exception:
         _save_partial(system, folder)
         raise

@@ -9,8 +9,6 @@ import sys
 import traceback
 from collections.abc import Sequence
 
-os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # stdout is for results; read when taichi is imported
-
 from tgslam import __version__
 from tgslam.cli import benchmark as bench
 from tgslam.cli import doctor, evaluate, render, run
