@@ -21,7 +21,7 @@ from tgslam.output.trajectory_io import read_trajectory
 from tools.export_synthetic import export
 
 FRAMES = 6
-FEW_STEPS = ("mapping.iterations=2", "mapping.final_iterations=2", "tracking.iterations=[3, 3]")
+FEW_STEPS = ("mapping.iterations=2", "mapping.final_iterations=2", "tracking.alignment_steps=[3, 3]")
 RESULTS = ("trajectory.txt", "keyframes.txt", "map.ply", "metrics.json")
 
 

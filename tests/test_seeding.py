@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tests.reference.seeding import cell_measures
-from tgslam.camera import Camera
+from tgslam.camera import Camera, SensorNoise
 from tgslam.config.input_settings import SyntheticConfig
 from tgslam.config.map_settings import SeedingConfig
 from tgslam.datasets.built_in import SyntheticSource
@@ -18,7 +18,7 @@ from tgslam.evaluation.image_metrics import masked_psnr
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, se3_exp, transform_points
 from tgslam.kernels import seeding as kernels
 from tgslam.mapping.insertion import Cells, cell_levels, cell_sizes, quadtree, seed
-from tgslam.ops import image as images
+from tgslam.ops.normals import normals_of
 from tgslam.ops.rasterize import Rasterizer
 from tgslam.types import Frame, Gaussians
 
@@ -324,7 +324,7 @@ def source() -> SyntheticSource:
 
 def seeded_frame(source: SyntheticSource, frame: Frame, T_cw: NDArray) -> tuple[Gaussians, Cells]:
     cells = quadtree(frame.colour, frame.depth_m, everywhere(frame.depth_m), CONFIG, SIGMA)
-    normals = images.normals(frame.depth_m, source.camera, sigma_per_m2=SIGMA)
+    normals = normals_of(frame.depth_m, source.camera, SensorNoise(SIGMA))
     return seed(cells, normals, source.camera, T_cw, 7, CONFIG), cells
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,15 +13,14 @@ from numpy.typing import NDArray
 
 from tgslam.camera import Camera
 from tgslam.config.schema import Config
-from tgslam.device import runtime
-from tgslam.errors import ConfigError, FrameError, GraphError
+from tgslam.errors import ConfigError, GraphError
 from tgslam.geometry import inverse, orthonormalized
 from tgslam.keyframing.covisibility import KeyframeSelector
 from tgslam.keyframing.structure_cue import StructureCue
 from tgslam.map.keyframe import Keyframe
 from tgslam.mapping.brightness import relative_gain
 from tgslam.mapping.mapper import Mapper
-from tgslam.ops.depth import measured_share, without_flying_pixels, without_range_limit
+from tgslam.preparation import Preparation
 from tgslam.tracking.motion import MotionFilter
 from tgslam.tracking.reference import NO_PLANES, Reference, references_of
 from tgslam.tracking.result import TrackingResult
@@ -31,7 +30,6 @@ from tgslam.types import Exposure, Frame, FrameReport, FrameStatus, Gaussians, P
 if TYPE_CHECKING:
     from tgslam.graph.closing import GraphClosing
 
-_MIN_DEPTH_SHARE = 0.01  # a frame with depth in fewer of its pixels is not usable
 _FALLBACKS = 3  # latest keyframes from which a lost camera is sought
 
 
@@ -48,11 +46,11 @@ class Slam:
     """RGB-D frames in; poses and a Gaussian map out. The first frame's camera is the world frame."""
 
     def __init__(self, camera: Camera, config: Config) -> None:
-        self.camera, self.sigma_per_m2 = camera, config.loss.depth_sigma_per_m2
+        self.camera, self._prepare = camera, Preparation(camera, config.loss.noise)
         self._reference_count = config.tracking.references
         self._matches_brightness = config.tracking.exposure == "gain"
         self.tracker = make_tracker(camera, config.tracking, config.loss)
-        self.motion = MotionFilter(config.tracking)
+        self.motion = MotionFilter(config.tracking.expert.motion)
         self.selector = KeyframeSelector(config.keyframes)
         rng = np.random.default_rng(config.seed)
         self.mapper = Mapper(
@@ -73,7 +71,7 @@ class Slam:
         """
         self._stage_s, self._remarks = {}, []
         with self._stage("prepare"):
-            frame = self._prepared(frame)
+            frame = self._prepare(frame)
         if not self.mapper.keyframes:
             first = TrackingResult(np.eye(4), Exposure(), np.eye(6), lost=False)
             self._map(frame, first)
@@ -216,17 +214,6 @@ class Slam:
             self.motion.update(frame.timestamp_s, T_cw, result.information)
             self.exposure = result.exposure
 
-    def _prepared(self, frame: Frame) -> Frame:
-        """The frame without flying pixels, as device arrays. Raises FrameError for a frame that cannot be used."""
-        size = (self.camera.height, self.camera.width)
-        if frame.depth_m.shape != size or frame.colour.shape != (*size, 3):
-            raise FrameError(f"frame {frame.index}: images of {frame.depth_m.shape} do not fit the camera's {size}")
-        in_range = without_range_limit(frame.depth_m, self.sigma_per_m2)
-        depth_m = without_flying_pixels(runtime.to_device(in_range), self.sigma_per_m2, self.camera.fx)
-        if measured_share(depth_m) < _MIN_DEPTH_SHARE:
-            raise FrameError(f"frame {frame.index}: depth in less than {_MIN_DEPTH_SHARE:.0%} of its pixels")
-        return replace(frame, colour=runtime.to_device(frame.colour), depth_m=depth_m)
-
     @contextmanager
     def _stage(self, name: str) -> Iterator[None]:
         start = time.perf_counter()
@@ -255,7 +242,7 @@ def _closing(camera: Camera, config: Config) -> GraphClosing | None:
         raise ConfigError("closures.enabled needs planes: set planes.enabled=true as well")
     from tgslam.graph.closing import GraphClosing
 
-    return GraphClosing(camera, config.loss.depth_sigma_per_m2, config.closures, config.loops)
+    return GraphClosing(camera, config.loss.noise, config.closures, config.loops)
 
 
 def _trajectory(timestamps_s: list[float], T_wc: list[NDArray[np.float64]]) -> Trajectory:

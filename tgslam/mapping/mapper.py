@@ -20,12 +20,12 @@ from tgslam.map.keyframe import Keyframe
 from tgslam.mapping.carriers import Carriers
 from tgslam.mapping.coarse import halved, seen_in_part, seen_whole
 from tgslam.mapping.fusion import block_centre, depth_pyramid, fused_depth, sample, turned
+from tgslam.mapping.holes import filled
 from tgslam.mapping.insertion import cell_levels, cell_sizes, quadtree, seed
 from tgslam.mapping.refinement import Refiner
 from tgslam.mapping.surface import Surface
 from tgslam.mapping.viewpoints import Viewpoints
-from tgslam.ops import image as images
-from tgslam.ops.depth import filled
+from tgslam.ops.normals import normals_of
 from tgslam.types import Gaussians, Matrix4
 
 if TYPE_CHECKING:
@@ -165,9 +165,7 @@ class Mapper:
         guess = filled(measured_m, self.camera.fx)
         depth_m = guess.depth_m
         colour = keyframe.exposure.gain * keyframe.colour() + np.float32(keyframe.exposure.bias)
-        normals_c = runtime.to_host(
-            images.normals(runtime.to_device(depth_m), self.camera, sigma_per_m2=self.loss.depth_sigma_per_m2)
-        )
+        normals_c = runtime.to_host(normals_of(runtime.to_device(depth_m), self.camera, self.loss.noise))
         if planes:
             planes = planes.continued(guess.source, self.camera.rays())
             depth_m = np.where((planes.depth_m > 0) & (measured_m <= 0), planes.depth_m, depth_m)
@@ -222,7 +220,7 @@ class Mapper:
         fused, self.information[rows], gain = fused_depth(z, self.information[rows], measured, evidence)
         self.carriers.learn(rows, len(self.keyframes) - 1, gain)
         T_wc = inverse(keyframe.T_cw)
-        normals = images.normals(runtime.to_device(depth_m), self.camera, sigma_per_m2=self.loss.depth_sigma_per_m2)
+        normals = normals_of(runtime.to_device(depth_m), self.camera, self.loss.noise)
         towards = runtime.to_host(normals)[v, u].astype(np.float64) @ T_wc[:3, :3].T
         self.gaussians.write("mean", rows, T_wc[:3, 3] + (fused / z)[:, None] * (means[rows] - T_wc[:3, 3]))
         self.gaussians.write("quat_wxyz", rows, turned(rotations, towards, gain))

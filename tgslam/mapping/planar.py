@@ -46,7 +46,7 @@ class PlanarPixels:
         """With the planes of PGIs where guesses take the depth of their pixels; they are on no PGI all the same, since
         nothing has measured it there.
 
-        source: [H, W] as of `depth.Guess`. rays: [H, W, 3] camera frame, z = 1.
+        source: [H, W] as of `holes.Guess`. rays: [H, W, 3] camera frame, z = 1.
         """
         known, directions = self.depth_m.ravel(), rays.reshape(-1, 3)
         at = np.flatnonzero((self.depth_m.ravel() <= 0) & (source.ravel() >= 0))
