@@ -212,7 +212,7 @@ FOLDERS = {
     "list without names": (lambda clip: rewrite(clip / "rgb.txt", lambda rows: ["0.1"]), 1, "rgb.txt:1"),
     "lists apart": (
         lambda clip: rewrite(clip / "depth.txt", lambda rows: [f"9{row}" for row in rows[1:]]), 1,
-        "association_tolerance_s",
+        "depth_tolerance_s",
     ),
 }  # fmt: skip
 

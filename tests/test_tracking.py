@@ -32,7 +32,7 @@ from tgslam.tracking.gauss_newton import GaussNewtonTracker
 from tgslam.tracking.lost import LostDetector
 from tgslam.tracking.motion import MotionFilter
 from tgslam.tracking.pyramid import LiveLevel, LivePyramid, ModelLevel, ModelPyramid, finest_level
-from tgslam.tracking.reference import NO_PLANES, Reference, references_of
+from tgslam.tracking.references import NO_PLANES, Reference, references_of
 from tgslam.tracking.result import TrackingResult
 from tgslam.tracking.solver import make_tracker, track_or_recover
 from tgslam.types import Exposure, Frame

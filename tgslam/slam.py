@@ -22,7 +22,7 @@ from tgslam.mapping.brightness import relative_gain
 from tgslam.mapping.mapper import Mapper
 from tgslam.preparation import Preparation
 from tgslam.tracking.motion import MotionFilter
-from tgslam.tracking.reference import NO_PLANES, Reference, references_of
+from tgslam.tracking.references import NO_PLANES, Reference, references_of
 from tgslam.tracking.result import TrackingResult
 from tgslam.tracking.solver import make_tracker, track_or_recover
 from tgslam.types import Exposure, Frame, FrameReport, FrameStatus, Gaussians, Plane, Trajectory

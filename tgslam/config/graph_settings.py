@@ -81,7 +81,7 @@ class IcpSettings:
 
     icp_rounds: int = setting(3, 0, 100, doc="Rounds of fitting planes anew and solving for the motion; 0 = off.")
     samples_px: int = setting(
-        2, 1, 64, doc="Every n-th pixel and row is used. Of too few pixels, fits are worse than the views' own."
+        2, 1, 64, doc="Step between pixels that are used, px. Of too few, fits are worse than the views' own."
     )
     flatness_sigma_m: float = setting(
         0.003, 1e-5, 1.0, doc="By how much real surfaces stray from planes, beyond the sensor's noise, m."

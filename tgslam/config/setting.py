@@ -27,14 +27,21 @@ def setting(
     return dataclasses.field(default=default, metadata=metadata)
 
 
+def own_settings(section: Any) -> list[tuple[Any, dataclasses.Field[Any]]]:
+    """(type, field) of the settings of `section` itself, without those of sections within it."""
+    hints = typing.get_type_hints(type(section))
+    fields = dataclasses.fields(section)
+    return [(hints[field.name], field) for field in fields if not dataclasses.is_dataclass(hints[field.name])]
+
+
 def settings_of(section: Any, prefix: str = "") -> Iterator[tuple[str, tuple[Any, dataclasses.Field[Any]]]]:
     """(dotted key, (type, field)) of every setting below `section`."""
-    hints = typing.get_type_hints(type(section))
+    for hint, field in own_settings(section):
+        yield prefix + field.name, (hint, field)
     for field in dataclasses.fields(section):
-        if dataclasses.is_dataclass(hints[field.name]):
-            yield from settings_of(getattr(section, field.name), f"{prefix}{field.name}.")
-        else:
-            yield prefix + field.name, (hints[field.name], field)
+        value = getattr(section, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from settings_of(value, f"{prefix}{field.name}.")
 
 
 def allowed(hint: Any, field: dataclasses.Field[Any]) -> str:
@@ -50,15 +57,15 @@ def allowed(hint: Any, field: dataclasses.Field[Any]) -> str:
         bounds = f" of {low} or more"
     elif high is not None:
         bounds = f" of {high} or less"
-    return _type_in_words(hint) + bounds
+    return _in_words(hint, bounds)
 
 
-def _type_in_words(hint: Any) -> str:
+def _in_words(hint: Any, bounds: str) -> str:
     if typing.get_origin(hint) is tuple:
         elements = typing.get_args(hint)
         length = "" if elements[-1] is Ellipsis else f"{len(elements)} values, "
-        return f"a list ({length}each {_type_in_words(elements[0])})"
+        return f"a list ({length}each {_in_words(elements[0], bounds)})"
     if isinstance(hint, types.UnionType):
-        return " or ".join(_type_in_words(option) for option in typing.get_args(hint))
+        return " or ".join(_in_words(option, "") for option in typing.get_args(hint)) + bounds
     words = {bool: "true or false", int: "a whole number", float: "a number", str: "text", type(None): "null"}
-    return words[hint]
+    return words[hint] + bounds

@@ -24,9 +24,7 @@ class ResidualSettings:
         doc="Part of the weights of intensity and gradient that is left to a rendering where references show the "
         "same; its depth then does not count at all. Renderings err alike over the whole image, slopes most of all.",
     )
-    correlated_px: float = setting(
-        100.0, 1.0, 1e6, doc="Neighbouring pixels err alike: so many of them inform like one."
-    )
+    correlated_px: float = setting(100.0, 1.0, 1e6, doc="Neighbouring pixels err alike: so many px inform like one.")
     max_distance_sigmas: float = setting(
         15.0, 1.0, 1000.0, doc="Pixels whose depth residual is more standard deviations than this are no match."
     )
@@ -39,7 +37,10 @@ class ModelSettings:
     renders: int = setting(1, 1, 5, doc="How often the map is rendered, each time at the latest estimate.")
     min_opacity: float = setting(0.8, 0.0, 1.0, doc="Pixels that the map covers less than this are not used.")
     rim_opacity: float = setting(
-        0.93, 0.0, 1.0, doc="Nor pixels round which the map covers less than this in the mean: they are at its rim."
+        0.93,
+        0.0,
+        1.0,
+        doc="Pixels round which the map covers less than this in the mean are at its rim, and have no say in colour.",
     )
 
 
@@ -50,7 +51,9 @@ class MotionSettings:
     acceleration_m: float = setting(5.0, 0.01, 1e4, doc="Standard deviation of the acceleration, m/s^2.")
     acceleration_rad: float = setting(20.0, 0.01, 1e4, doc="Standard deviation of the turn's acceleration, rad/s^2.")
     speed_m: float = setting(1.0, 0.001, 1e3, doc="Standard deviation of the speed while it is not known, m/s.")
-    speed_rad: float = setting(2.0, 0.001, 1e3, doc="Standard deviation of the turn's speed likewise, rad/s.")
+    speed_rad: float = setting(
+        2.0, 0.001, 1e3, doc="Standard deviation of the turn's speed while it is not known, rad/s."
+    )
 
 
 @dataclass(frozen=True)
@@ -68,15 +71,25 @@ class LostSettings:
     """When a tracked pose is not to be believed."""
 
     min_inlier_ratio: float = setting(
-        0.3, 0.0, 1.0, doc="Lost if fewer of the matched pixels have a residual below three standard deviations."
+        0.3,
+        0.0,
+        1.0,
+        doc="Lost if less than this part of the matched pixels has a residual below three standard deviations.",
     )
-    min_map_overlap: float = setting(0.1, 0.0, 1.0, doc="Lost if fewer of the frame's pixels meet the map.")
-    min_map_agreement: float = setting(0.6, 0.0, 1.0, doc="Lost if fewer of those have the map's depth.")
+    min_map_overlap: float = setting(
+        0.1, 0.0, 1.0, doc="Lost if less than this part of the frame's pixels meets the map."
+    )
+    min_map_agreement: float = setting(
+        0.6, 0.0, 1.0, doc="Lost if less than this part of the pixels that meet the map has its depth."
+    )
     sound_colour_residual: float = setting(
         0.04, 0.0, 1.0, doc="A mean intensity residual up to this is never suspect, intensity in [0, 1]."
     )
     max_colour_ratio: float = setting(
-        3.0, 1.0, 1000.0, doc="Lost if it is above that, and more than this many times the usual one."
+        3.0,
+        1.0,
+        1000.0,
+        doc="Lost if the mean intensity residual is suspect, and more than this many times the usual one.",
     )
     max_condition: float = setting(1e7, 1.0, 1e15, doc="Lost if the normal equations are worse conditioned.")
 
@@ -132,9 +145,12 @@ class KeyframeConfig:
         "(intersection over union).",
     )
     max_unexplained: float = setting(
-        0.08, 0.0, 1.0, doc="Or if the map does not cover more than this part of the pixels with depth."
+        0.08, 0.0, 1.0, doc="A keyframe is due if the map does not cover more than this part of the pixels with depth."
     )
     max_translation: float = setting(
-        0.1, 0.0, 100.0, doc="Or if the camera has moved more than this part of the median depth."
+        0.1,
+        0.0,
+        100.0,
+        doc="A keyframe is due if the camera has moved more than this part of the median depth since the last one.",
     )
-    max_interval: int = setting(30, 1, 100_000, doc="Or after so many frames.")
+    max_interval: int = setting(30, 1, 100_000, doc="A keyframe is due after so many frames without one.")

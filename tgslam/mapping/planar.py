@@ -21,7 +21,7 @@ from tgslam.planes.instances.instance import NO_ID, PlanarInstance
 from tgslam.planes.instances.plane_table import PlaneTable
 from tgslam.planes.instances.registry import PlaneRegistry
 from tgslam.planes.segmentation.extraction import extract_planes
-from tgslam.tracking.reference import NO_PLANES
+from tgslam.tracking.references import NO_PLANES
 
 _MAX_SLANT = 0.1  # of its depth by which a plane's changes at most where it continues into a hole
 _CLOSING_PX = 7  # window in which a PGI may surround a pixel

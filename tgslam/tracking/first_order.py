@@ -21,7 +21,7 @@ from tgslam.ops.splats import MapGradient
 from tgslam.ops.vector_adam import VectorAdam
 from tgslam.tracking.gauss_newton import GaussNewtonTracker
 from tgslam.tracking.pyramid import finest_level
-from tgslam.tracking.reference import Reference
+from tgslam.tracking.references import Reference
 from tgslam.tracking.result import TrackingResult
 from tgslam.types import Exposure, Frame
 

@@ -26,7 +26,7 @@ from tgslam.tracking.pyramid import (
     ReferencePyramid,
     finest_level,
 )
-from tgslam.tracking.reference import NO_PLANES, Reference
+from tgslam.tracking.references import NO_PLANES, Reference
 from tgslam.tracking.result import TrackingResult
 from tgslam.types import Exposure, Frame
 

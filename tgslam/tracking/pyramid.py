@@ -19,7 +19,7 @@ from tgslam.ops import alignment
 from tgslam.ops import image as images
 from tgslam.ops.normals import PlaneFits
 from tgslam.ops.rasterize import RenderImages
-from tgslam.tracking.reference import NO_PLANES, Reference
+from tgslam.tracking.references import NO_PLANES, Reference
 from tgslam.types import Frame
 
 # blocks of 2x2 px on each side: a rendered surface has little noise, and wide fits of a measured one round its edges
