@@ -38,7 +38,7 @@ from tgslam.tracking.solver import make_tracker, track_or_recover
 from tgslam.types import Exposure, Frame
 
 CONFIG = TrackingConfig()
-RESIDUALS, MOTION = CONFIG.expert.residuals, MotionSettings()
+RESIDUALS, HANDS = CONFIG.expert.residuals, MotionSettings()
 PATIENT = changed(CONFIG, solver="first_order", adam_steps=(60, 60), adam_rate=0.002)
 CASES = [("room", 30), ("room", 120), ("blank", 30), ("blank", 120)]
 
@@ -734,7 +734,7 @@ EXACT = 1e14 * np.eye(6)  # the information of poses without noise
 
 
 def test_without_a_past_nothing_moves():
-    motion = MotionFilter(MOTION)
+    motion = MotionFilter(HANDS)
     np.testing.assert_array_equal(motion.predict(5.0), np.eye(4))
     motion.update(5.0, START, EXACT)
     np.testing.assert_allclose(motion.predict(9.0), START, atol=1e-12)
@@ -742,7 +742,7 @@ def test_without_a_past_nothing_moves():
 
 @pytest.mark.parametrize("times_s", [(0.0, 0.1, 0.2), (0.0, 0.03, 0.5), (7.0, 7.9, 7.95)])
 def test_a_steady_motion_is_foretold_at_any_time(times_s):
-    motion = MotionFilter(MOTION)
+    motion = MotionFilter(HANDS)
     for time_s in times_s[:2]:
         motion.update(time_s, moved(time_s), EXACT)
     np.testing.assert_allclose(motion.predict(times_s[2]), moved(times_s[2]), atol=1e-9)
@@ -750,7 +750,7 @@ def test_a_steady_motion_is_foretold_at_any_time(times_s):
 
 
 def test_equal_or_earlier_timestamps_keep_the_velocity():
-    motion = MotionFilter(MOTION)
+    motion = MotionFilter(HANDS)
     motion.update(0.0, moved(0.0), EXACT)
     motion.update(0.1, moved(0.1), EXACT)
     for time_s in (0.1, 0.05):
@@ -759,15 +759,15 @@ def test_equal_or_earlier_timestamps_keep_the_velocity():
 
 
 def test_the_prediction_is_trusted_but_for_what_hands_do_and_less_without_a_velocity():
-    motion = MotionFilter(MOTION)
+    motion = MotionFilter(HANDS)
     assert not motion.information(3.0).any()
     motion.update(3.0, START, EXACT)
     unknown = motion.information(3.1)
     motion.update(3.1, moved(0.1), EXACT)
     for elapsed_s in (0.03, 0.1, 1.0):
         sigmas = np.diag(motion.information(3.1 + elapsed_s)) ** -0.5
-        np.testing.assert_allclose(sigmas[:3], MOTION.acceleration_rad * elapsed_s**2, rtol=1e-3)
-        np.testing.assert_allclose(sigmas[3:], MOTION.acceleration_m * elapsed_s**2, rtol=1e-3)
+        np.testing.assert_allclose(sigmas[:3], HANDS.acceleration_rad * elapsed_s**2, rtol=1e-3)
+        np.testing.assert_allclose(sigmas[3:], HANDS.acceleration_m * elapsed_s**2, rtol=1e-3)
     assert (np.diag(unknown) < 0.9 * np.diag(motion.information(3.2))).all()
     assert np.isfinite(motion.information(3.1)).all() and np.isfinite(motion.information(2.0)).all()
     motion.coast(3.2, moved(0.2))
@@ -783,16 +783,16 @@ def test_velocity_is_what_all_poses_say_of_it_by_their_uncertainties():
     measured_m = np.concatenate([[0.0], 0.4 * dt * np.arange(1, count) + rng.normal(0.0, 0.006, count - 1)])
     weights = rng.uniform(0.5, 2.0, count) * 0.006**-2
     weights[15:] = 1.0  # all but unseen from here on
-    motion, T_cw = MotionFilter(MOTION), np.eye(4)
+    motion, T_cw = MotionFilter(HANDS), np.eye(4)
     motion.update(0.0, T_cw.copy(), EXACT)
     for k in range(1, count):  # as a tracker fuses what it sees with the prediction
         predicted_m, trust = motion.predict(k * dt)[0, 3], motion.information(k * dt)[3, 3]
         T_cw[0, 3] = (trust * predicted_m + weights[k] * measured_m[k]) / (trust + weights[k])
         motion.update(k * dt, T_cw.copy(), np.diag([1e6, 1e6, 1e6, weights[k], 1e6, 1e6]))
     # unknown: the velocity before each frame but the first, where it is 0 +- speed_m; x_k is what they have added up to
-    rows, sides = [np.eye(count - 1)[0] / MOTION.speed_m], [0.0]
-    jump = MOTION.acceleration_m * dt
-    rows[0] /= np.hypot(1.0, jump / MOTION.speed_m)  # it may have changed before the first step, too
+    rows, sides = [np.eye(count - 1)[0] / HANDS.speed_m], [0.0]
+    jump = HANDS.acceleration_m * dt
+    rows[0] /= np.hypot(1.0, jump / HANDS.speed_m)  # it may have changed before the first step, too
     for k in range(1, count - 1):
         rows.append((np.eye(count - 1)[k] - np.eye(count - 1)[k - 1]) / jump)
         sides.append(0.0)
@@ -810,7 +810,7 @@ def test_velocity_is_what_all_poses_say_of_it_by_their_uncertainties():
 
 
 def test_a_world_that_moves_takes_the_prediction_with_it_and_not_the_velocity():
-    motion, correction = MotionFilter(MOTION), se3_exp([0.1, 0.2, -0.1, 0.3, 0.0, 0.4])
+    motion, correction = MotionFilter(HANDS), se3_exp([0.1, 0.2, -0.1, 0.3, 0.0, 0.4])
     motion.move(correction)
     motion.update(0.0, moved(0.0), EXACT)
     motion.update(0.1, moved(0.1), EXACT)
@@ -830,7 +830,7 @@ def test_a_prior_holds_the_directions_in_which_pixels_say_little_and_no_others()
 
 
 def test_coasting_halves_the_motion_each_time():
-    motion = MotionFilter(MOTION)
+    motion = MotionFilter(HANDS)
     motion.update(0.0, moved(0.0), EXACT)
     motion.update(1.0, moved(1.0), EXACT)
     motion.coast(1.0, moved(1.0))

@@ -11,8 +11,8 @@ from tgslam.device import runtime
 from tgslam.device.arrays import require
 from tgslam.kernels import adam as kernels
 
-_MAX_CORRECTIONS = 1 << 15
-_MIN_CAPACITY = 64
+_MAX_CORRECTIONS = 1 << 15  # that are tabulated; for the usual betas they are 1 after 18,000 updates
+_MIN_CAPACITY = 64  # rows, so that small maps do not take new memory at every keyframe
 
 
 class Adam:

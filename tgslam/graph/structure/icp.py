@@ -27,10 +27,10 @@ from tgslam.types import FloatImage
 Vector = NDArray[np.float64]
 
 _STEPS = 3  # at most of a round: matches change from step to step, so that they never settle to the last digit
-_LEAST_POINTS = 30  # of a plane, to fit it anew
+_LEAST_POINTS = 30  # of a plane, to fit it anew: of fewer, the view's own fit is better
 _LEAST_SHARE = 1e-3  # of the information of a plane's best known parameter that of the worst one is at least
 _BEHIND = np.array([[0.0, 0.0, -1e3]])  # m: a point that meets nothing, since arrays on a device cannot be empty
-_MAX_SQUARES = 2.0  # mean squared residual, in sigmas, of points that match something
+_MAX_SQUARES = 2.0  # mean squared residual, in sigmas, of points that match something: right ones have about 1
 
 
 @dataclass(frozen=True)

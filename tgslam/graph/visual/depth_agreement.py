@@ -12,8 +12,8 @@ from tgslam.geometry import inverse, transform_points
 from tgslam.ops.image import DEPTH_EDGE
 from tgslam.types import FloatImage
 
-_ACROSS = 80  # pixels at most that are kept of a row
-_SIGMAS = 4.0
+_ACROSS = 80  # pixels at most that are kept of a row: what is compared are shares, not outlines
+_SIGMAS = 4.0  # of two measurements by which one surface may differ, beyond what a slanted pixel does
 
 
 @dataclass(frozen=True)

@@ -26,14 +26,14 @@ from tgslam.ops import closure_icp as closure_fit
 
 Vector = NDArray[np.float64]
 
-_RANSAC_ROUNDS = 150
-_CONFIDENCE = 0.999
-_FIRST_STEPS = 3  # before it is decided anew which features agree
-_ROBUST_SIGMAS = 3.0  # beyond which a feature counts less
-_SURFACE_STEPS = 4
+_RANSAC_ROUNDS = 150  # at most: where half of the matches are right, four right ones are drawn all but surely
+_CONFIDENCE = 0.999  # that the best motion has been sampled, to stop before
+_FIRST_STEPS = 3  # before it is decided anew which features agree; the sampled motion is close already
+_ROBUST_SIGMAS = 3.0  # beyond which a feature counts less: few right ones are
+_SURFACE_STEPS = 4  # at most: matches change from step to step, so that they never settle to the last digit
 _MATCH_DISTANCE_M = 0.1  # of surfaces: those farther apart are different ones
-_INLIER_SIGMAS = 4.0  # of three coordinates
-_PLACES_ACROSS = 80  # the image: features in one of its squares are one
+_INLIER_SIGMAS = 4.0  # of three coordinates: one right match in a thousand is farther off
+_PLACES_ACROSS = 80  # the image: features in one of its squares are one, as corners found on several levels are
 
 
 @dataclass(frozen=True)
