@@ -57,17 +57,17 @@ SETTINGS = POSE + 12
 
 # What a live pixel holds: m, intensity, its gradient and that one's length (G of Eq. 10) in 1/px
 LIVE_DEPTH, LIVE_GREY, LIVE_GX, LIVE_GY, LIVE_STRENGTH = range(5)
-LIVE = 5
+LIVE = 5  # of them
 # What a model pixel holds: its surface (a normal in the model camera's frame, 0 = none, then the depth in m, 0 = none,
 # negative at the rim of the map), and its intensity with the first and second derivatives by the pixel
 MODEL_DEPTH = 3
 SURFACE = 4
 GREY, GX, GY, GXX, GXY, GYY = range(6)
-TEXTURE = 8
+TEXTURE = 8  # of them, padded to a power of two
 
-_INLIER_SIGMAS = 3.0
+_INLIER_SIGMAS = 3.0  # of a matched pixel's depth residual, to count as an inlier
 _MIN_COSINE = 0.2  # grazing rays: the noise across the surface is taken to be no less than this share of that along z
-_NEAR_M = 0.05
+_NEAR_M = 0.05  # points nearer to the model's camera are not looked up
 _MIN_DEPTH_M = 1e-3  # keeps what does not count finite
 _LANE = tuple(float(j) for j in range(LANES))
 _PART_STEP = 128  # a loop over parts counts in steps of this, since Taichi hands a thread 512 iterations at a time

@@ -5,9 +5,8 @@ image. A parallel iteration takes a block of points and writes its own row of su
 import taichi as ti
 
 BLOCK = 64  # points
-PLANE = 12  # of a plane: normal, d, then each tangent with where the centroid lies along it, m
 HEIGHT_SUMS = 10  # w, wu, wv, wuu, wuv, wvv, wh, wuh, wvh over the tangents' u and v and the height h; and points
-UNKNOWNS = 6
+UNKNOWNS = 6  # rotation 3, translation 3
 TRIANGLE = UNKNOWNS * (UNKNOWNS + 1) // 2
 SQUARES = TRIANGLE + UNKNOWNS  # sum of robustly weighted squared residuals
 MATCHES = SQUARES + 1
@@ -34,7 +33,7 @@ def point_at(points: ti.template(), k):
 def plane_heights(
     points: F2,  # [N, 3] m, camera
     row: I1,  # [N] row of `planes`
-    planes: F2,  # [P, 12] camera
+    planes: F2,  # [P, 12] camera: normal, d, then each tangent with where the centroid lies along it, m
     depth_sigma: ti.f32,  # sigma_z = this * z^2, 1/m
     model_sigma: ti.f32,  # m, of a surface about its plane
     partial: F3,  # [blocks, P, 10] out

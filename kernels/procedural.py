@@ -4,10 +4,10 @@ import taichi as ti
 
 PLAIN, CLOUD, TILES, PLANKS, BOOKS, PICTURE, WEAVE = range(7)  # material kinds
 
-_OCTAVES = 4
+_OCTAVES = 4  # of noise, each twice as fine and half as strong as the one before
 _STEP_I, _STEP_J = 1640531513, 1013904223  # what a lattice step adds to the word that is hashed
 _JOINT = 0.035  # share of a tile or plank that is joint
-_PICTURE_BORDER_M = 0.035
+_PICTURE_BORDER_M = 0.035  # the mount round a picture
 
 
 @ti.func

@@ -31,7 +31,7 @@ MOMENTS = 20
 
 BLUR_DEPTH = 0.03  # px^2 in the regression of depth on the pixel: BLUR would flatten the depth slope of small splats
 BLUR = 0.3  # px^2 added to the screen covariance, the 3DGS standard's low-pass filter
-NEAR_M = 0.05
+NEAR_M = 0.05  # splats nearer to the camera's plane are not drawn
 EDGE = 1.3  # the Jacobian is evaluated at most this many half-images off the axis
 _COLUMNS = 9  # of a splat row, U to ZV, that `splat_of` returns in their order, and INV_Z after them
 # log((1 + t) / (1 - t)) / t by t^2, |t| <= 1/3, to 8e-9 relative: Lawson's iteratively reweighted least squares

@@ -12,15 +12,15 @@ from tgslam.kernels.procedural import surface_colour
 
 QUAD, BOX, ELLIPSOID, CYLINDER = range(4)  # shapes
 
-TILE_PX = 16
-NO_HIT = 1e30
+TILE_PX = 16  # a side of the squares for which primitives are listed
+NO_HIT = 1e30  # m, in place of a depth
 LAYER_LEAD = 3e-4  # relative depth by which a layer wins over the one below
-_TINY = 1e-9
+_TINY = 1e-9  # in place of a zero divisor
 _MIN_COSINE = 0.03  # bounds the footprint at grazing angles
 _EDGE_SHADE_M = 0.2  # reach of the darkening towards corners
 _OCCLUSION_M = 0.09  # how far in front of a surface its occlusion is looked up
 _OCCLUSION = 0.9  # darkening where everything around is solid
-_SKY = (0.55, 0.62, 0.7)
+_SKY = (0.55, 0.62, 0.7)  # RGB of rays that hit nothing
 
 Ints2 = ti.types.ndarray(dtype=ti.i32, ndim=2)
 Ints1 = ti.types.ndarray(dtype=ti.i32, ndim=1)

@@ -14,11 +14,11 @@ from collections.abc import Callable
 import taichi as ti
 
 TILE = 16  # px
-LANES = 16
-CHUNK = 4  # px
+LANES = 16  # floats of a vector: AVX-512's width
+CHUNK = 4  # px, a side of the square of pixels that a vector holds
 PER_ROW = TILE // CHUNK
 CHUNKS = PER_ROW * PER_ROW
-ALPHA_MIN = 1.0 / 255.0
+ALPHA_MIN = 1.0 / 255.0  # what covers a pixel less is left out of it: the 3DGS standard's bounds
 ALPHA_MAX = 0.99
 SPREAD = 16  # a loop over tiles counts in steps of this, since Taichi hands a thread 512 iterations at a time
 T_MIN = 1e-4  # a chunk whose every pixel lets less than this through is finished

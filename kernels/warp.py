@@ -2,7 +2,7 @@
 
 import taichi as ti
 
-WARP = 32
+WARP = 32  # threads
 ALL = 0xFFFFFFFF  # mask of a whole warp
 
 

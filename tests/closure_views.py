@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from tests.plane_worlds import Box, looking, shifted
-from tgslam.camera import Camera
+from tgslam.camera import Camera, SensorNoise
 from tgslam.geometry import inverse, tangent_axes
 from tgslam.graph.structure.icp import View
 from tgslam.planes.estimate import PlaneEstimate
 
 CAMERA = Camera(160, 120, 130.0, 128.0, 79.1, 60.3)
 SIGMA_PER_M2 = 0.0015
+NOISE = SensorNoise(SIGMA_PER_M2)
 ROOM = Box((4.0, 2.5, 5.0))
 BALLS = (((1.3, 1.9, 4.0), 0.5), ((2.6, 2.1, 3.7), 0.35), ((2.0, 1.4, 4.4), 0.4))
 WALK = (looking(np.array([1.9, 1.3, 1.4]), 0.25, 0.2), looking(np.array([2.2, 1.25, 1.9]), -0.1, 0.3))  # T_cw
@@ -19,9 +20,8 @@ WALK = (looking(np.array([1.9, 1.3, 1.4]), 0.25, 0.2), looking(np.array([2.2, 1.
 
 def view(T_cw: np.ndarray, rng: np.random.Generator, balls: bool = True, noise: float = 1.0) -> View:
     """What a camera sees: depth with the sensor's noise and some holes, and which wall (or none) each pixel is on."""
-    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
-    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1)
-    nearest, ids = np.full(u.shape, np.inf), np.full(u.shape, -1)
+    rays = CAMERA.rays()
+    nearest, ids = np.full(CAMERA.shape, np.inf), np.full(CAMERA.shape, -1)
     for index in range(6):
         normal, offset = ROOM.plane(index)
         normal_c = T_cw[:3, :3] @ normal
@@ -37,8 +37,8 @@ def view(T_cw: np.ndarray, rng: np.random.Generator, balls: bool = True, noise: 
         z = (b - root) / a
         closer = (b * b > a * d) & (z > 0) & (z < nearest)
         nearest[closer], ids[closer] = z[closer], -1
-    depth = nearest + noise * SIGMA_PER_M2 * nearest**2 * rng.standard_normal(u.shape)
-    depth[rng.random(u.shape) < 0.02] = 0.0
+    depth = nearest + noise * SIGMA_PER_M2 * nearest**2 * rng.standard_normal(CAMERA.shape)
+    depth[rng.random(CAMERA.shape) < 0.02] = 0.0
     return View(depth.astype(np.float32), ids)
 
 

@@ -21,7 +21,7 @@ from tgslam.output.trajectory_io import read_trajectory
 from tools.export_synthetic import export
 
 FRAMES = 6
-FEW_STEPS = ("mapping.iterations=2", "mapping.final_iterations=2", "tracking.iterations=[3, 3]")
+FEW_STEPS = ("mapping.iterations=2", "mapping.final_iterations=2", "tracking.alignment_steps=[3, 3]")
 RESULTS = ("trajectory.txt", "keyframes.txt", "map.ply", "metrics.json")
 
 
@@ -212,7 +212,7 @@ FOLDERS = {
     "list without names": (lambda clip: rewrite(clip / "rgb.txt", lambda rows: ["0.1"]), 1, "rgb.txt:1"),
     "lists apart": (
         lambda clip: rewrite(clip / "depth.txt", lambda rows: [f"9{row}" for row in rows[1:]]), 1,
-        "association_tolerance_s",
+        "depth_tolerance_s",
     ),
 }  # fmt: skip
 

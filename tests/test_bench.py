@@ -270,7 +270,13 @@ def test_map_reports_the_stages_of_an_iteration(tmp_path: Path, capsys: pytest.C
 
 @pytest.mark.parametrize("solver", ["gauss_newton", "first_order"])
 def test_track_reports_the_stages_of_a_step(solver: str, capsys: pytest.CaptureFixture[str]) -> None:
-    settings = [*SMALL_ROOM, "--set", f"tracking.solver={solver}", "--set", "tracking.first_order_iterations=[2]"]
+    settings = [
+        *SMALL_ROOM,
+        "--set",
+        f"tracking.solver={solver}",
+        "--set",
+        "tracking.expert.first_order.adam_steps=[2]",
+    ]
     result = run_json("track", "--frames", ":5", *settings, "--quiet")
     assert (result["frames"], result["solver"], result["width"]) == (2, solver, 64)
     assert {"prepare", "pyramid", "align", "select"} < set(result["stages_ms"])

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tests.plane_worlds import Box, odometry, position_errors_m, walking
+from tests.tiers import changed
 from tgslam.camera import Camera, SensorNoise
 from tgslam.config.graph_settings import ClosureConfig, LoopConfig
 from tgslam.config.plane_settings import PlanesConfig
@@ -20,9 +20,10 @@ from tgslam.map.keyframes import Keyframe, Keyframes
 from tgslam.slam import Slam
 from tgslam.types import Exposure, Frame, Matrix4
 
-CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+CAMERA, NOISE = Camera(64, 48, 60.0, 60.0, 31.5, 23.5), SensorNoise(0.0015)
 SIZE_M = (2.0, 2.4, 16.0)
-CONFIG = ClosureConfig(
+CONFIG = changed(
+    ClosureConfig(),
     enabled=True,
     formulation="landmarks",
     icp_rounds=0,
@@ -81,7 +82,7 @@ class Walk:
         self.truth = walking(SIZE_M, count)
         self.box, self.steps = Box(SIZE_M), odometry(self.truth, rng, noise)
         self.seen = [self.box.views(T_cw, rng, noise) for T_cw in self.truth]
-        self.keyframes = Keyframes(CAMERA, SensorNoise(0.0015))
+        self.keyframes = Keyframes(CAMERA, NOISE)
         self.planes = Planes()
 
     def add(self, closing: GraphClosing) -> None:
@@ -101,7 +102,7 @@ class Walk:
 
 
 def walked(config: ClosureConfig, seed: int, **settings: float) -> Walk:
-    walk, closing = Walk(seed, **settings), GraphClosing(CAMERA, 0.0015, config, LoopConfig())
+    walk, closing = Walk(seed, **settings), GraphClosing(CAMERA, NOISE, config, LoopConfig())
     for _ in walk.truth:
         walk.add(closing)
     return walk
@@ -111,10 +112,8 @@ def walked(config: ClosureConfig, seed: int, **settings: float) -> Walk:
 def test_planes_take_back_most_of_the_drift(formulation: str) -> None:
     before, after = [], []
     for seed in range(3):
-        config = ClosureConfig(**{**vars(CONFIG), "formulation": formulation})
-        before.append(
-            walked(ClosureConfig(**{**vars(config), "formulation": "closures", "interval": 1000}), seed).error_m()
-        )
+        config = changed(CONFIG, formulation=formulation)
+        before.append(walked(changed(config, formulation="closures", interval=1000), seed).error_m())
         after.append(walked(config, seed).error_m())
     assert np.mean(after) < 0.5 * np.mean(before)
     assert all(a < 1.1 * b for a, b in zip(after, before, strict=True))
@@ -122,12 +121,12 @@ def test_planes_take_back_most_of_the_drift(formulation: str) -> None:
 
 @pytest.mark.parametrize("formulation", ["closures", "landmarks"])
 def test_edges_and_landmarks_ask_how_certain_the_same_views_are(formulation: str) -> None:
-    config = ClosureConfig(**{**vars(CONFIG), "formulation": formulation, "surface_sigma_m": 0.0007})
+    config = changed(CONFIG, formulation=formulation, view_sigma_m=0.0007)
     assert walked(config, 0).planes.asked_m == {0.0007}
 
 
 def test_where_everything_is_right_nothing_moves() -> None:
-    walk = walked(ClosureConfig(**{**vars(CONFIG), "least_shift_m": 0.001, "least_turn_rad": 0.001}), 0, noise=0.0)
+    walk = walked(changed(CONFIG, least_shift_m=0.001, least_turn_rad=0.001), 0, noise=0.0)
     expected = Walk(0, noise=0.0)
     for k, keyframe in enumerate(walk.keyframes):
         np.testing.assert_allclose(keyframe.T_cw, expected.truth[k], atol=2e-3)
@@ -135,9 +134,7 @@ def test_where_everything_is_right_nothing_moves() -> None:
 
 def test_small_corrections_wait_until_they_add_up() -> None:
     walk = Walk(1)
-    closing = GraphClosing(
-        CAMERA, 0.0015, ClosureConfig(**{**vars(CONFIG), "least_shift_m": 0.02, "least_turn_rad": 0.02}), LoopConfig()
-    )
+    closing = GraphClosing(CAMERA, 0.0015, changed(CONFIG, least_shift_m=0.02, least_turn_rad=0.02), LoopConfig())
     moved = []
     for _ in walk.truth:
         before = [k.T_cw for k in walk.keyframes]
@@ -151,7 +148,7 @@ def test_small_corrections_wait_until_they_add_up() -> None:
 
 
 def test_what_refinement_changes_between_corrections_is_kept() -> None:
-    walk, closing = Walk(2), GraphClosing(CAMERA, 0.0015, CONFIG, LoopConfig())
+    walk, closing = Walk(2), GraphClosing(CAMERA, NOISE, CONFIG, LoopConfig())
     for _ in range(10):
         walk.add(closing)
     nudged, untouched = walk.keyframes[4].T_cw.copy(), walk.keyframes[4].T_cw
@@ -163,7 +160,7 @@ def test_what_refinement_changes_between_corrections_is_kept() -> None:
 
 
 def test_planes_that_merge_are_one_landmark_from_then_on() -> None:
-    walk, closing = Walk(3), GraphClosing(CAMERA, 0.0015, CONFIG, LoopConfig())
+    walk, closing = Walk(3), GraphClosing(CAMERA, NOISE, CONFIG, LoopConfig())
     first, other = sorted({i for seen in walk.seen for i in seen})[:2]
     for k, seen in enumerate(walk.seen):
         if k < 20 and first in seen:
@@ -173,10 +170,7 @@ def test_planes_that_merge_are_one_landmark_from_then_on() -> None:
     walk.planes.renamed[77] = first
     for _ in range(15):
         walk.add(closing)
-    assert (
-        walk.error_m()
-        < 0.7 * walked(ClosureConfig(**{**vars(CONFIG), "formulation": "closures", "interval": 1000}), 3).error_m()
-    )
+    assert walk.error_m() < 0.7 * walked(changed(CONFIG, formulation="closures", interval=1000), 3).error_m()
     assert closing.closure_count == 0
     assert other != first
 
@@ -198,8 +192,8 @@ def test_refinement_and_planes_that_disagree_do_not_drive_graph_and_map_apart() 
     rng, box = np.random.default_rng(0), Box((4.0, 2.5, 5.0))
     tracked = inverse(se3_exp([0.0, 0.0, 0.0, 2.0, 1.2, 1.0]))
     askew = se3_exp([0.005, 0.0, 0.0, 0.0, 0.0, 0.0])
-    closing, planes = GraphClosing(CAMERA, 0.0015, CONFIG, LoopConfig()), Planes()
-    world = SimpleNamespace(keyframes=Keyframes(CAMERA, SensorNoise(0.0015)), planes=planes)
+    closing, planes = GraphClosing(CAMERA, NOISE, CONFIG, LoopConfig()), Planes()
+    world = SimpleNamespace(keyframes=Keyframes(CAMERA, NOISE), planes=planes)
     for k in range(40):
         world.keyframes.add(blank_keyframe(k, tracked, 1e6 * np.eye(6)))
         planes.views[k] = box.views(askew @ tracked if k else tracked, rng, noise=0.0)
@@ -211,8 +205,8 @@ def test_refinement_and_planes_that_disagree_do_not_drive_graph_and_map_apart() 
 
 def test_closures_tie_keyframes_once_they_move_something() -> None:
     """Before, closures have said nothing that the map does not."""
-    config = replace(CONFIG, formulation="closures", least_shift_m=0.02, least_turn_rad=0.02)
-    walk, closing = Walk(0), GraphClosing(CAMERA, 0.0015, config, LoopConfig())
+    config = changed(CONFIG, formulation="closures", least_shift_m=0.02, least_turn_rad=0.02)
+    walk, closing = Walk(0), GraphClosing(CAMERA, NOISE, config, LoopConfig())
     close, corrections = closing.close, []
     closing.close = lambda *arguments: corrections.append(close(*arguments)) or corrections[-1]  # type: ignore[method-assign]
     for _ in walk.truth:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tests.closure_views import CAMERA, SIGMA_PER_M2, WALK, fits, motion, view
+from tests.closure_views import CAMERA, NOISE, SIGMA_PER_M2, WALK, fits, motion, view
 from tests.reference import closure_icp as reference
-from tgslam.config.graph_settings import ClosureConfig
+from tgslam.config.graph_settings import AcceptanceSettings, IcpSettings
 from tgslam.device import runtime
 from tgslam.geometry import inverse, se3_exp, se3_log, tangent_axes
 from tgslam.graph.relative import measure
@@ -18,8 +18,8 @@ from tgslam.graph.structure.candidates import shared_planes
 from tgslam.graph.structure.icp import Registration, View
 from tgslam.ops import closure_icp as closure_fit
 
-CONFIG = ClosureConfig(samples_px=4)
-INTRINSICS = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
+CONFIG = IcpSettings(samples_px=4)
+LIMITS = AcceptanceSettings()
 MODEL = 0.003
 
 
@@ -45,7 +45,7 @@ def test_heights_of_points(points: int, planes: int) -> None:
     at[near] -= 0.97 * (np.sum(at * rows[row, :3], 1) + rows[row, 3])[near, None] * rows[row, :3][near]
     at = np.float32(at)
     expected = reference.plane_heights(at.astype(float), row, rows, SIGMA_PER_M2, MODEL)
-    got = closure_fit.height_moments(runtime.to_device(at), runtime.to_device(row, np.int32), rows, SIGMA_PER_M2, MODEL)
+    got = closure_fit.height_moments(runtime.to_device(at), runtime.to_device(row, np.int32), rows, NOISE, MODEL)
     w, u, v, uu, uv, vv, h, uh, vh, count = expected.T
     information = np.moveaxis(np.array([[vv, -uv, v], [-uv, uu, -u], [v, -u, w]]), -1, 0)
     assert_allclose(got.information, information, rtol=2e-3, atol=1e-4 * abs(information).max(initial=0.0))
@@ -60,13 +60,13 @@ def test_distances_from_a_surface(step: int) -> None:
     still, moving = (view(T, rng) for T in WALK)
     v, u = np.mgrid[1 : CAMERA.height : 2 * step, 1 : CAMERA.width : 2 * step].reshape(2, -1)
     z = moving.depth_m[v, u]
-    points = np.float32(np.column_stack([(u - CAMERA.cx) / CAMERA.fx * z, (v - CAMERA.cy) / CAMERA.fy * z, z]))
+    points = np.float32(CAMERA.points_at(u, v, z))
     T_ij = inverse(se3_exp([0.01, 0.02, -0.01, 0.02, 0.01, 0.03]) @ motion())
     expected = reference.surface_distances(
-        points.astype(float), T_ij, still.depth_m.astype(float), INTRINSICS, SIGMA_PER_M2, MODEL, 0.1
+        points.astype(float), T_ij, still.depth_m.astype(float), CAMERA.intrinsics, SIGMA_PER_M2, MODEL, 0.1
     )
     got = closure_fit.surface_distances(
-        runtime.to_device(points), T_ij, runtime.to_device(still.depth_m), CAMERA, SIGMA_PER_M2, MODEL, 0.1
+        runtime.to_device(points), T_ij, runtime.to_device(still.depth_m), CAMERA, NOISE, MODEL, 0.1
     )
     assert expected[3] > 100
     assert abs(got.matches - expected[3]) <= max(2, 0.005 * expected[3])  # rounding, at a pixel's border
@@ -79,24 +79,26 @@ def test_the_derivative_is_by_a_left_perturbation_of_the_motion() -> None:
     still, moving = (view(T, np.random.default_rng(0), noise=0.0) for T in WALK)
     v, u = np.mgrid[1 : CAMERA.height : 5, 1 : CAMERA.width : 5].reshape(2, -1)
     z = moving.depth_m[v, u].astype(float)
-    points = np.column_stack([(u - CAMERA.cx) / CAMERA.fx * z, (v - CAMERA.cy) / CAMERA.fy * z, z])
+    points = CAMERA.points_at(u, v, z)
     depth = still.depth_m.astype(float)
     T_ji, xi = se3_exp([0.01, 0.0, 0.01, 0.01, 0.0, 0.02]) @ motion(), 1e-5 * np.random.default_rng(1).normal(size=6)
-    first = {k: (e, j) for k, e, j, *_ in reference.matches(points, inverse(T_ji), depth, INTRINSICS, 0.1)}
-    second = {k: e for k, e, *_ in reference.matches(points, inverse(se3_exp(xi) @ T_ji), depth, INTRINSICS, 0.1)}
+    first = {k: (e, j) for k, e, j, *_ in reference.matches(points, inverse(T_ji), depth, CAMERA.intrinsics, 0.1)}
+    second = {
+        k: e for k, e, *_ in reference.matches(points, inverse(se3_exp(xi) @ T_ji), depth, CAMERA.intrinsics, 0.1)
+    }
     change = np.array([(second[k] - e, j @ xi) for k, (e, j) in first.items() if k in second])
     same_pixel = abs(change[:, 0] - change[:, 1]) < 1e-8
     assert same_pixel.mean() > 0.95
 
 
 def refined(
-    views: list[View], planes: list[dict], prior: np.ndarray, config: ClosureConfig, ids: tuple[int, ...] | None = None
+    views: list[View], planes: list[dict], prior: np.ndarray, config: IcpSettings, ids: tuple[int, ...] | None = None
 ):  # type: ignore[no-untyped-def]
     """Before and after, from planes `ids` alone (default: all that both see)."""
     chosen = [{k: p for k, p in side.items() if ids is None or k in ids} for side in planes]
     shared, pairs = shared_planes(*chosen)
-    start = measure(pairs, prior, config)
-    return start, Registration(*views, shared, CAMERA, SIGMA_PER_M2, config).refine(pairs, start)
+    start = measure(pairs, prior, LIMITS)
+    return start, Registration((views[0], views[1]), shared, CAMERA, NOISE, config, LIMITS).refine(pairs, start)
 
 
 def error_of(found) -> np.ndarray:  # type: ignore[no-untyped-def]
@@ -124,7 +126,7 @@ def test_points_do_not_spoil_good_plane_fits() -> None:
         rng = np.random.default_rng(seed)
         views = [view(T, rng, balls=False) for T in WALK]
         planes = [fits(seen, T, rng, noise=0.15) for seen, T in zip(views, WALK, strict=True)]
-        start, found = refined(views, planes, motion(), ClosureConfig())
+        start, found = refined(views, planes, motion(), IcpSettings())
         before.append(start.directions @ error_of(start))
         after.append(start.directions @ error_of(found))
     assert np.sqrt(np.mean(np.square(after))) < 0.6 * np.sqrt(np.mean(np.square(before)))
@@ -170,6 +172,6 @@ def test_many_points_do_not_make_an_edge_certain() -> None:
     views = [view(T, rng) for T in WALK]
     planes = [fits(seen, T, rng) for seen, T in zip(views, WALK, strict=True)]
     coarse, fine = (
-        refined(views, planes, motion(), ClosureConfig(samples_px=step))[1].motion.information for step in (6, 1)
+        refined(views, planes, motion(), IcpSettings(samples_px=step))[1].motion.information for step in (6, 1)
     )
     assert_allclose(np.trace(fine[3:, 3:]), np.trace(coarse[3:, 3:]), rtol=0.1)

@@ -9,20 +9,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from tests.closure_views import CAMERA, SIGMA_PER_M2, WALK, fits, motion, view
+from tests.closure_views import CAMERA, NOISE, WALK, fits, motion, view
 from tests.plane_worlds import Box, looking, shifted
 from tests.test_plane_estimate import random_pose
-from tgslam.config.graph_settings import ClosureConfig
+from tests.tiers import changed
+from tgslam.config.graph_settings import AcceptanceSettings, ClosureConfig
 from tgslam.geometry import inverse, se3_exp, se3_log, tangent_axes
+from tgslam.graph.findings import Findings
 from tgslam.graph.gating import passes
 from tgslam.graph.relative import PlanePairs, measure, of_planes
 from tgslam.graph.structure.candidates import candidates
-from tgslam.graph.structure.search import ClosureSearch, Findings
+from tgslam.graph.structure.search import ClosureSearch
 from tgslam.planes.estimate import PlaneEstimate, stacked
 
 seeds = st.integers(0, 2**32 - 1)
 CONFIG = ClosureConfig()
-FINE = ClosureConfig(known_rad=10.0, known_m=10.0)  # whatever is measured at all counts
+LIMITS = AcceptanceSettings()
+FINE = AcceptanceSettings(known_rad=10.0, known_m=10.0)  # whatever is measured at all counts
 
 
 def oriented(normals: np.ndarray, rng: np.random.Generator) -> PlaneEstimate:
@@ -80,7 +83,7 @@ def test_two_planes_leave_their_common_line_to_the_prior(seed: int) -> None:
     in_i, T_ji = oriented(directions(2, rng), rng), random_pose(rng)
     pairs = PlanePairs(noisy(in_i, rng), noisy(in_i.transformed(T_ji), rng))
     prior = small_motion(rng) @ T_ji
-    found = measure(pairs, prior, CONFIG)
+    found = measure(pairs, prior, LIMITS)
     assert found.rank == 5
     moved = pairs.in_i.transformed(found.T_ji).normal
     line = np.concatenate([np.zeros(3), np.cross(*moved)])
@@ -103,7 +106,7 @@ def test_parallel_planes_change_nothing_across_their_normal(seed: int) -> None:
     T_ji = random_pose(rng)
     pairs = PlanePairs(noisy(in_i, rng), noisy(in_i.transformed(T_ji), rng))
     prior = small_motion(rng, 0.02) @ T_ji
-    found = measure(pairs, prior, CONFIG)
+    found = measure(pairs, prior, LIMITS)
     assert found.rank == 3
     shift = inverse(found.T_ji)[:3, 3] - inverse(prior)[:3, 3]
     across = shift - (shift @ normal[0]) * normal[0]
@@ -131,15 +134,15 @@ def test_a_wrong_match_is_inconsistent() -> None:
     in_i, T_ji = oriented(directions(3, rng), rng), random_pose(rng)
     in_i = stacked([*(in_i[k] for k in range(3)), oriented(directions(1, rng), rng)[0]])
     in_j = noisy(in_i.transformed(T_ji), rng)
-    assert measure(PlanePairs(in_i, in_j), T_ji, CONFIG).consistent(0.999)
+    assert measure(PlanePairs(in_i, in_j), T_ji, LIMITS).consistent(0.999)
     wrong = stacked([*(in_j[k] for k in range(3)), shifted(in_j[3], np.array([0.0, 0.0, 0.1]))])
-    assert not measure(PlanePairs(in_i, wrong), T_ji, CONFIG).consistent(0.999)
+    assert not measure(PlanePairs(in_i, wrong), T_ji, LIMITS).consistent(0.999)
 
 
 def test_gating_looks_at_measured_directions_only() -> None:
     rng = np.random.default_rng(0)
     in_i, T_ji = oriented(directions(2, rng), rng), random_pose(rng)
-    found = measure(PlanePairs(in_i, in_i.transformed(T_ji)), T_ji, CONFIG)
+    found = measure(PlanePairs(in_i, in_i.transformed(T_ji)), T_ji, LIMITS)
     line = np.cross(*in_i.transformed(T_ji).normal)
     covariance = 1e-6 * np.eye(6)
     along = se3_exp(np.concatenate([np.zeros(3), 0.5 * line])) @ T_ji
@@ -163,7 +166,7 @@ class TestCandidates:
         found = candidates(views[-1], dict(enumerate(views[:-1])), T_ji, CONFIG)
         assert len(found) == CONFIG.max_edges
         ages = [59 - c.keyframe for c in found]
-        assert ages == sorted(ages, reverse=True) and ages[0] > 40 and CONFIG.min_gap < ages[-1] < 20
+        assert ages == sorted(ages, reverse=True) and ages[0] > 40 and CONFIG.closure_gap < ages[-1] < 20
         assert all(len(c.shared) >= 2 for c in found)
 
     def test_parallel_or_single_planes_are_no_candidates(self) -> None:
@@ -178,7 +181,7 @@ class TestCandidates:
         all_three = {k: planes[k] for k in range(3)}
         two = {k: planes[k] for k in range(2)}
         earlier = {0: two, 1: all_three, 2: two, 3: two}
-        config = ClosureConfig(max_edges=1, min_gap=1)
+        config = ClosureConfig(max_edges=1, closure_gap=1)
         (best,) = candidates(all_three, earlier, dict.fromkeys(earlier, np.eye(4)), config)
         assert best.keyframe == 1 and best.shared == (0, 1, 2)
 
@@ -186,7 +189,7 @@ class TestCandidates:
 class TestSearch:
     """From sightings to closures, through ICP and gates, in a room with things that are on no plane."""
 
-    CONFIG = ClosureConfig(interval=2, min_gap=1, samples_px=4)
+    CONFIG = changed(ClosureConfig(), interval=2, closure_gap=1, samples_px=4)
 
     def found(
         self, config: ClosureConfig, graph_T_ji: np.ndarray, sigma: float, planes_of_j: dict | None = None
@@ -196,7 +199,7 @@ class TestSearch:
         first, second = (fits(seen, T, rng, 0.3) for seen, T in zip(views, WALK, strict=True))
         sightings = {0: first, 5: {}, 9: planes_of_j if planes_of_j is not None else second}
         T_cw = {0: np.eye(4), 5: np.eye(4), 9: graph_T_ji}
-        search = ClosureSearch(CAMERA, SIGMA_PER_M2, config)
+        search = ClosureSearch(CAMERA, NOISE, config)
         return search.find(
             sightings, T_cw, lambda i, j: (graph_T_ji, sigma**2 * np.eye(6)), lambda k: views[0 if k == 0 else 1]
         )

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from tgslam.config.loader import dump, find_config, load, packaged_names
 from tgslam.config.schema import Config
+from tgslam.config.tracking_settings import LostSettings
 from tgslam.errors import ConfigError
 
 
@@ -49,16 +50,40 @@ def test_a_packaged_config_is_found_by_name_from_anywhere(tmp_path: Path, monkey
 
 def test_file_then_overrides(tmp_path: Path) -> None:
     path = written(tmp_path, "seed: 3\ndataset:\n  max_depth_m: 4\n  distortion: [0.1, -2e-1]\nloss:\n")
-    config = load(path, ["seed=4", "loss.charbonnier_colour=1e-3", "synthetic.noise=false", "synthetic.scene=1"])
+    config = load(path, ["seed=4", "loss.weight_l1=1e-3", "synthetic.noise=false", "synthetic.scene=1"])
     assert (config.seed, config.dataset.max_depth_m, config.dataset.distortion) == (4, 4.0, (0.1, -0.2))
     assert type(config.dataset.max_depth_m) is float
-    assert (config.loss.charbonnier_colour, config.synthetic.noise, config.synthetic.scene) == (1e-3, False, "1")
+    assert (config.loss.weight_l1, config.synthetic.noise, config.synthetic.scene) == (1e-3, False, "1")
     assert load(None, ["dataset.distortion=0.1, 0.2"]).dataset.distortion == (0.1, 0.2)
     assert load(None, ["dataset.distortion="]).dataset.distortion == ()
 
 
+def test_settings_of_the_expert_tier(tmp_path: Path) -> None:
+    path = written(tmp_path, "tracking:\n  references: 3\n  expert:\n    lost: {max_condition: 1e6}\n    motion:\n")
+    config = load(path, ["tracking.expert.lost.min_map_overlap=0.2", "tracking.expert.first_order.adam_steps=3, 4"])
+    assert (config.tracking.references, config.tracking.expert.lost.max_condition) == (3, 1e6)
+    assert config.tracking.expert.lost == dataclasses.replace(LostSettings(), max_condition=1e6, min_map_overlap=0.2)
+    assert config.tracking.expert.first_order.adam_steps == (3, 4)
+    assert config.tracking.expert.motion == Config().tracking.expert.motion
+
+
+def test_errors_in_the_expert_tier_name_the_whole_key() -> None:
+    near = "did you mean `tracking.expert.lost.max_condition` (a number from 1.0 to 1000000000000000.0)?"
+    assert near in message(None, "tracking.expert.lost.max_conditions=1e6")
+    assert near in message(None, "tracking.max_condition=1e6")
+    assert near in message(None, "max_condition=1e6")
+    assert near in message(None, "tracking.expert.max_condition=1e6")
+    assert "did you mean the section `tracking.expert.lost`?" in message(None, "tracking.expert.losst.max_condition=1")
+    assert "did you mean the section `tracking.expert`?" in message(None, "tracking.experts.lost.max_condition=1")
+    assert "`tracking.expert.lost.max_condition` = 0 is out of range" in message(
+        None, "tracking.expert.lost.max_condition=0"
+    )
+    assert "`tracking.expert.lost` is a section" in message(None, "tracking.expert.lost=1")
+    assert "valid here are: residuals, model, motion, first_order, lost" in message(None, "tracking.expert.zzzz=1")
+
+
 def test_scientific_notation_without_a_point_is_a_number(tmp_path: Path) -> None:
-    assert load(written(tmp_path, "loss: {charbonnier_colour: 1e-6}")).loss.charbonnier_colour == 1e-6
+    assert load(written(tmp_path, "loss: {depth_sigma_per_m2: 1e-6}")).loss.depth_sigma_per_m2 == 1e-6
 
 
 def test_base_is_relative_then_packaged_then_overridden(tmp_path: Path) -> None:

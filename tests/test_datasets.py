@@ -336,8 +336,8 @@ def test_list_that_is_no_text(folder: Path) -> None:
 
 
 def test_no_depth_in_time(folder: Path) -> None:
-    with pytest.raises(DatasetError, match="association_tolerance_s"):
-        opened(folder, replace(TUM, association_tolerance_s=0.001))
+    with pytest.raises(DatasetError, match="depth_tolerance_s"):
+        opened(folder, replace(TUM, depth_tolerance_s=0.001))
 
 
 def test_colour_without_depth_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -10,7 +10,7 @@ from tgslam.geometry import se3_exp
 from tgslam.keyframing.covisibility import KeyframeSelector
 from tgslam.types import Frame
 
-CONFIG = KeyframeConfig(min_overlap=0.8, max_unexplained=0.1, max_translation=0.1, max_interval=20)
+CONFIG = KeyframeConfig(min_covisibility=0.8, max_unexplained=0.1, max_translation=0.1, max_interval=20)
 DEPTH_M = np.array([[0.0, 0.0, 2.0, 2.0], [0.0, 0.0, 2.0, 9.0]], np.float32)  # median of the measured: 2 m
 HERE = se3_exp([0.3, -0.2, 0.1, 1.0, -2.0, 0.5])
 

@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from tgslam.camera import Camera
-from tgslam.config.graph_settings import ClosureConfig, LoopConfig
+from tests.tiers import changed
+from tgslam.camera import Camera, SensorNoise
+from tgslam.config.graph_settings import LoopConfig, SolvingSettings
 from tgslam.config.input_settings import SyntheticConfig
 from tgslam.config.schema import Config
 from tgslam.datasets.built_in import SyntheticSource, synthetic_camera
 from tgslam.geometry import inverse, se3_exp, se3_log
+from tgslam.graph.findings import Findings
 from tgslam.graph.pose_graph import PoseGraph
-from tgslam.graph.structure.search import Findings
 from tgslam.graph.visual.depth_agreement import DepthGrid, agreement
 from tgslam.graph.visual.features import Detector, Features, matches
 from tgslam.graph.visual.loop_search import LoopSearch
@@ -27,6 +28,8 @@ from tgslam.synthetic.sensor import DEPTH_SIGMA_PER_M2
 from tgslam.types import Frame, RelativePose
 
 CONFIG = LoopConfig()
+MATCHING = CONFIG.expert.matching
+NOISE = SensorNoise(DEPTH_SIGMA_PER_M2)
 CAMERA = synthetic_camera(320, 240)
 MAX_M, MAX_RAD = 0.02, np.deg2rad(0.5)
 STEP_SIGMA = np.array([1e-3] * 3 + [3e-3] * 3)  # rad, m: what the graph believes of a step between keyframes
@@ -65,7 +68,7 @@ def drifting(truth: Walk, error: np.ndarray) -> dict[int, np.ndarray]:
 
 def searched(truth: Walk, T_cw: dict[int, np.ndarray], config: LoopConfig = CONFIG) -> list[Findings]:
     """Of each keyframe in turn."""
-    search = LoopSearch(CAMERA, DEPTH_SIGMA_PER_M2, config)
+    search = LoopSearch(CAMERA, NOISE, config)
     known: dict[int, np.ndarray] = {}
     found = []
     for k, frame in enumerate(truth.frames):
@@ -79,7 +82,7 @@ def errors(truth: Walk, found: list[Findings]) -> np.ndarray:
     rows = []
     for k, findings in enumerate(found):
         for closure in findings.closures:
-            assert closure.earlier <= k - CONFIG.min_gap and closure.shared == () and closure.measured.rank == 6
+            assert closure.earlier <= k - CONFIG.loop_gap and closure.shared == () and closure.measured.rank == 6
             error = se3_log(closure.measured.T_ji @ inverse(truth.motion(closure.earlier, k)))
             squares = error @ closure.measured.motion.information @ error
             rows.append((np.linalg.norm(error[:3]), np.linalg.norm(error[3:]), squares))
@@ -87,7 +90,7 @@ def errors(truth: Walk, found: list[Findings]) -> np.ndarray:
 
 
 def features(frame: Frame) -> Features:
-    return Detector(CONFIG).detect(frame.colour, frame.depth_m)
+    return Detector(CONFIG.features, MATCHING.corner_contrast).detect(frame.colour, frame.depth_m)
 
 
 def look(frame: Frame) -> Look:
@@ -113,16 +116,16 @@ class TestFeatures:
     def test_none_beside_holes_or_across_depth_edges(self) -> None:
         frame = walk("room", 2, 8).frames[0]
         depth = np.full_like(frame.depth_m, 2.0)
-        assert len(Detector(CONFIG).detect(frame.colour, depth)) > 300
+        assert len(Detector(CONFIG.features, MATCHING.corner_contrast).detect(frame.colour, depth)) > 300
         depth[:, 160:] = 3.0
         depth[120:] = 0.0
-        u, v = np.rint(Detector(CONFIG).detect(frame.colour, depth).pixels).T
+        u, v = np.rint(Detector(CONFIG.features, MATCHING.corner_contrast).detect(frame.colour, depth).pixels).T
         assert len(u) > 20 and (v < 119).all() and (abs(u - 159.5) > 1).all()
 
     def test_matches_are_of_the_same_points(self) -> None:
         truth = walk("room", 2, 8)
         a, b = (features(frame) for frame in truth.frames)
-        i, j = matches(a, b, CONFIG).T
+        i, j = matches(a, b, MATCHING).T
         assert len(i) > 60 and len(set(i)) == len(set(j)) == len(i)
         moved = a.points(CAMERA)[i] @ truth.motion(0, 1)[:3, :3].T + truth.motion(0, 1)[:3, 3]
         assert np.median(np.linalg.norm(moved - b.points(CAMERA)[j], axis=1)) < 0.02
@@ -131,14 +134,14 @@ class TestFeatures:
         rng = np.random.default_rng(0)
         descriptors = rng.integers(0, 256, (20, 32), np.uint8)
         a = Features(rng.uniform(0, 300, (20, 2)).astype("f4"), np.ones(20, "f4"), np.ones(20, "f4"), descriptors)
-        assert_array_equal(matches(a, a, CONFIG), np.column_stack([np.arange(20)] * 2))
+        assert_array_equal(matches(a, a, MATCHING), np.column_stack([np.arange(20)] * 2))
 
         def twice(shift_px: float) -> Features:
             pixels = np.concatenate([a.pixels, a.pixels + np.float32(shift_px)])
             return Features(pixels, np.ones(40, "f4"), np.ones(40, "f4"), np.concatenate([descriptors] * 2))
 
-        assert len(matches(a, twice(100.0), CONFIG)) == 0
-        assert len(matches(a, twice(1.0), CONFIG)) == 20  # one corner found twice
+        assert len(matches(a, twice(100.0), MATCHING)) == 0
+        assert len(matches(a, twice(1.0), MATCHING)) == 20  # one corner found twice
 
     def test_spread_over_the_image(self) -> None:
         """One busy corner takes no more than its share."""
@@ -146,17 +149,19 @@ class TestFeatures:
         picture = np.full((240, 320), 0.5, np.float32)
         picture[40:200:20, 40:280:20] = 0.7
         picture[40:80, 40:80] = np.kron(rng.uniform(0, 1, (10, 10)), np.ones((4, 4)))
-        found = Detector(replace(CONFIG, features=100)).detect(
+        found = Detector(100, MATCHING.corner_contrast).detect(
             np.repeat(picture[..., None], 3, 2), np.ones_like(picture)
         )
         assert len(found) == 100 and (found.pixels > 85).any(axis=1).mean() > 0.5
 
     @pytest.mark.parametrize("shape", [(240, 320), (20, 24)])
     def test_no_texture_gives_none(self, shape: tuple[int, int]) -> None:
-        empty = Detector(CONFIG).detect(np.full((*shape, 3), 0.5, np.float32), np.ones(shape, np.float32))
+        empty = Detector(CONFIG.features, MATCHING.corner_contrast).detect(
+            np.full((*shape, 3), 0.5, np.float32), np.ones(shape, np.float32)
+        )
         assert len(empty) == 0 and empty.points(CAMERA).shape == (0, 3)
         some = features(walk("room", 2, 8).frames[0])
-        assert len(matches(empty, some, CONFIG)) == len(matches(some, empty, CONFIG)) == 0
+        assert len(matches(empty, some, MATCHING)) == len(matches(some, empty, MATCHING)) == 0
 
 
 class TestRetrieval:
@@ -193,22 +198,22 @@ class TestDepthAgreement:
     def test_right_and_wrong_motions(self) -> None:
         truth = walk("room", 2, 8)
         a, b = (DepthGrid.of(frame.depth_m, CAMERA) for frame in truth.frames)
-        agreeing, overlap = agreement(a, b, truth.motion(0, 1), DEPTH_SIGMA_PER_M2)
+        agreeing, overlap = agreement(a, b, truth.motion(0, 1), NOISE)
         assert agreeing > 0.97 and overlap > 0.6
         moved = se3_exp([0.0, 0.0, 0.0, 0.0, 0.0, -0.6]) @ truth.motion(0, 1)
-        assert agreement(a, b, moved, DEPTH_SIGMA_PER_M2)[0] < 0.5
+        assert agreement(a, b, moved, NOISE)[0] < 0.5
         turned = se3_exp([0.0, 2.5, 0.0, 0.0, 0.0, 0.0]) @ truth.motion(0, 1)
-        assert agreement(a, b, turned, DEPTH_SIGMA_PER_M2)[1] < 0.05
+        assert agreement(a, b, turned, NOISE)[1] < 0.05
 
     def test_what_is_hidden_speaks_neither_for_nor_against(self) -> None:
         wall, hand = np.full((240, 320), 3.0, np.float32), np.full((240, 320), 3.0, np.float32)
         hand[:, :160] = 1.0
         a, b = DepthGrid.of(wall, CAMERA), DepthGrid.of(hand, CAMERA)
-        assert_allclose(agreement(a, b, np.eye(4), DEPTH_SIGMA_PER_M2), (2 / 3, 0.5), atol=1e-6)
+        assert_allclose(agreement(a, b, np.eye(4), NOISE), (2 / 3, 0.5), atol=1e-6)
 
     def test_no_depth(self) -> None:
         nothing = DepthGrid.of(np.zeros((240, 320), np.float32), CAMERA)
-        assert agreement(nothing, nothing, np.eye(4), DEPTH_SIGMA_PER_M2) == (0.0, 0.0)
+        assert agreement(nothing, nothing, np.eye(4), NOISE) == (0.0, 0.0)
 
     def test_grid_points_are_where_the_pixels_are(self) -> None:
         camera = Camera(101, 75, 90.0, 91.0, 50.2, 37.7)
@@ -222,7 +227,7 @@ class TestVerification:
     def compared(self, scene: str, count: int, step: int, config: LoopConfig = CONFIG) -> list[Sameness | None]:
         """Keyframe 0 with each of the others."""
         looks = [look(frame) for frame in walk(scene, count, step).frames]
-        verification = Verification(CAMERA, DEPTH_SIGMA_PER_M2, config)
+        verification = Verification(CAMERA, NOISE, config)
         return [verification.compare(looks[0], other) for other in looks[1:]]
 
     def test_views_of_one_place(self) -> None:
@@ -236,7 +241,7 @@ class TestVerification:
         """Wide apart, and with some of the features only."""
         truth = walk("room", 4, 8)
         first, last = look(truth.frames[0]), look(truth.frames[3])
-        verification = Verification(CAMERA, DEPTH_SIGMA_PER_M2, replace(CONFIG, min_seen_again=0.0))
+        verification = Verification(CAMERA, NOISE, changed(CONFIG, min_seen_again=0.0))
         same = verification.compare(first, last)
         assert same is not None
 
@@ -259,7 +264,7 @@ class TestVerification:
         there = replace(frame, depth_m=frame.depth_m.copy())
         there.depth_m[:, :110] = there.depth_m[:, 230:] = 1.0
         there.depth_m[:90] = 0.8
-        verification = Verification(CAMERA, DEPTH_SIGMA_PER_M2, replace(CONFIG, min_inlier_share=0.0))
+        verification = Verification(CAMERA, NOISE, changed(CONFIG, min_inlier_share=0.0))
         assert verification.compare(look(frame), look(frame)) is not None
         assert verification.compare(look(frame), look(there)) is None
 
@@ -270,25 +275,26 @@ class TestVerification:
         other[80:165, 90:205] = pattern[80:165, 90:205]
         wall = np.full((240, 320), 2.0, np.float32)
         here, there = (look(Frame(0, 0.0, np.repeat(p[..., None], 3, 2), wall)) for p in (pattern, other))
-        few = replace(CONFIG, min_inliers=10, known_rad=0.1, known_m=0.2)
-        same = Verification(CAMERA, DEPTH_SIGMA_PER_M2, replace(few, min_seen_again=0.0)).compare(here, there)
+        few = changed(CONFIG, min_inliers=10, known_rad=0.1, known_m=0.2)
+        same = Verification(CAMERA, NOISE, changed(few, min_seen_again=0.0)).compare(here, there)
         assert same is not None
         assert_allclose(same.measured.T_ji, np.eye(4), atol=0.01)
-        verification = Verification(CAMERA, DEPTH_SIGMA_PER_M2, few)
+        verification = Verification(CAMERA, NOISE, few)
         assert verification.compare(here, there) is None
         assert verification.compare(here, here) is not None
 
     def test_another_exposure(self) -> None:
         first, second = walk("room", 2, 8).frames
         darker = replace(second, colour=second.colour * np.float32(0.7))
-        same = Verification(CAMERA, DEPTH_SIGMA_PER_M2, CONFIG).compare(look(first), look(darker))
+        same = Verification(CAMERA, NOISE, CONFIG).compare(look(first), look(darker))
         assert same is not None and same.inliers > 40
 
     def test_no_more_is_known_than_all_features_have_in_error_together(self) -> None:
         for same in self.compared("room", 2, 8):
             assert same is not None
+            common = CONFIG.expert.measuring
             sigma2 = np.diag(np.linalg.inv(same.measured.motion.information))
-            assert (sigma2 > np.array([CONFIG.common_sigma_rad**2] * 3 + [CONFIG.common_sigma_m**2] * 3)).all()
+            assert (sigma2 > np.array([common.common_sigma_rad**2] * 3 + [common.common_sigma_m**2] * 3)).all()
 
 
 class TestSearch:
@@ -315,7 +321,7 @@ class TestSearch:
     def test_equal_doors_are_no_loop(self) -> None:
         """Even where the graph rules nothing out."""
         truth = walk("corridor", 70, 16)
-        found = searched(truth, drifting(truth, self.DRIFT), replace(CONFIG, understated=1000.0))
+        found = searched(truth, drifting(truth, self.DRIFT), changed(CONFIG, understated=1000.0))
         assert all(findings == Findings((), 0, 0) for findings in found)
 
     def test_the_same_every_time(self) -> None:
@@ -330,7 +336,7 @@ class TestSearch:
 
     def test_one_keyframe_alone_is_not_believed(self) -> None:
         truth = walk("turn", 42, 11)
-        found = searched(truth, truth.T_cw, replace(CONFIG, partner_m=1e-4))
+        found = searched(truth, truth.T_cw, changed(CONFIG, partner_m=1e-4))
         assert not any(findings.closures for findings in found)
         assert all(findings.inconsistent >= 2 for findings in found[-5:])
 
@@ -338,13 +344,13 @@ class TestSearch:
         """A place that looks exactly like one seen before, when the graph says the camera has gone on all the time."""
         truth = walk("room", 4, 8)
         away = np.eye(4)
-        away[0, 3] = step_m * CONFIG.min_gap
+        away[0, 3] = step_m * CONFIG.loop_gap
         blank = [np.full((240, 320, 3), 0.5, np.float32), np.ones((240, 320), np.float32)]
-        images = [[f.colour, f.depth_m] for f in truth.frames[:3]] + [blank] * CONFIG.min_gap
+        images = [[f.colour, f.depth_m] for f in truth.frames[:3]] + [blank] * CONFIG.loop_gap
         images += [[truth.frames[1].colour, truth.frames[1].depth_m]]
         T_cw = {k: truth.T_cw[min(k, 2)] for k in range(len(images))}
         T_cw[len(images) - 1] = truth.T_cw[1] @ away
-        search = LoopSearch(CAMERA, DEPTH_SIGMA_PER_M2, CONFIG)
+        search = LoopSearch(CAMERA, NOISE, CONFIG)
         return [search.find(k, *image, T_cw, believed(T_cw)) for k, image in enumerate(images)][-1]
 
     def test_a_perfect_copy_is_told_apart_by_how_far_it_is(self) -> None:
@@ -353,15 +359,15 @@ class TestSearch:
         assert closure.earlier == 1
 
     def test_images_without_features(self) -> None:
-        search = LoopSearch(CAMERA, DEPTH_SIGMA_PER_M2, CONFIG)
+        search = LoopSearch(CAMERA, NOISE, CONFIG)
         T_cw = dict.fromkeys(range(30), np.eye(4))
         nothing = np.zeros((240, 320, 3), np.float32), np.zeros((240, 320), np.float32)
         assert {search.find(k, *nothing, T_cw, believed(T_cw)) for k in range(30)} == {Findings((), 0, 0)}
 
     def test_the_graph_closes_the_loop(self) -> None:
         truth = walk("loop", 52, 11)
-        graph = PoseGraph(ClosureConfig())
-        search = LoopSearch(CAMERA, DEPTH_SIGMA_PER_M2, CONFIG)
+        graph = PoseGraph(SolvingSettings())
+        search = LoopSearch(CAMERA, NOISE, CONFIG)
         odometry = drifting(truth, self.DRIFT)
         information = np.diag(STEP_SIGMA**-2.0)
         for k, frame in enumerate(truth.frames):

@@ -7,6 +7,7 @@ import pytest
 
 from tests.reference import image as reference_image
 from tests.reference import loss as reference
+from tests.tiers import changed
 from tgslam.config.map_settings import LossConfig
 from tgslam.device import runtime
 from tgslam.ops import loss as losses
@@ -211,7 +212,7 @@ def at_offset(image, offset_bytes):
 
 def test_the_gate_moves_weight_from_colour_to_depth():
     rendering, observed = scene(40, 48, masked=False)
-    plain = replace(CONFIG, gate_depth_boost=0.0)
+    plain = changed(CONFIG, gate_depth_boost=0.0)
     gated, gt = evaluate(rendering, observed)
     ungated, _ = evaluate(rendering, observed, plain)
     ratio = runtime.to_host(gated.g_depth) / runtime.to_host(ungated.g_depth)
@@ -225,7 +226,7 @@ def test_without_the_gate_no_term_asks_for_texture():
     rendering, observed = scene(40, 48, masked=False)
     ungated, gt = evaluate(rendering, observed, replace(CONFIG, gate=False))
     assert not gt["gate"].any()
-    plain, _ = evaluate(rendering, observed, replace(CONFIG, gate=False, gate_depth_boost=0.0))
+    plain, _ = evaluate(rendering, observed, changed(CONFIG, gate=False, gate_depth_boost=0.0))
     np.testing.assert_array_equal(runtime.to_host(ungated.g_depth), runtime.to_host(plain.g_depth))
     gated, _ = evaluate(rendering, observed)
     assert ungated.parts["ssim"] > gated.parts["ssim"], "texture and all else count alike"

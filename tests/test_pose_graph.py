@@ -14,11 +14,13 @@ from numpy.testing import assert_allclose
 
 from tests.plane_worlds import Box, odometry, position_errors_m, shifted, turning, walking
 from tests.test_plane_estimate import random_plane, random_pose
-from tgslam.config.graph_settings import ClosureConfig
+from tests.tiers import changed
+from tgslam.config.graph_settings import ClosureConfig, SolvingSettings
 from tgslam.errors import GraphError
 from tgslam.geometry import inverse, se3_exp, se3_log
+from tgslam.graph.factors import PlaneError
 from tgslam.graph.gating import passes
-from tgslam.graph.pose_graph import GraphEstimate, PoseGraph, _PlaneError
+from tgslam.graph.pose_graph import GraphEstimate, PoseGraph
 from tgslam.graph.relative import Measurement, measure
 from tgslam.graph.structure.candidates import candidates, shared_planes
 from tgslam.planes.estimate import PlaneEstimate
@@ -72,7 +74,7 @@ def run(
     gated: bool = True,
 ) -> GraphEstimate:
     """Keyframe by keyframe, as the system does, with planes as landmarks, closures, or both."""
-    graph = PoseGraph(config)
+    graph, acceptance = PoseGraph(config.expert.solving), config.expert.acceptance
     for k, seen in enumerate(views):
         if k == 0:
             graph.add_first(0, truth[0])
@@ -86,8 +88,8 @@ def run(
             T_ji = dict(enumerate(estimate.T_cw[k] @ inverse(estimate.T_cw[:k])))
             for found in candidates(seen, dict(enumerate(views[:k])), T_ji, config):
                 i = found.keyframe
-                measured = corrupt(measure(shared_planes(views[i], seen)[1], T_ji[i], config))
-                if not gated or passes(measured, *graph.relative(i, k), config.gate_probability):
+                measured = corrupt(measure(shared_planes(views[i], seen)[1], T_ji[i], acceptance))
+                if not gated or passes(measured, *graph.relative(i, k), acceptance.gate_probability):
                     graph.add_closure(i, k, measured.motion)
             estimate = graph.optimise()
     return estimate
@@ -114,7 +116,7 @@ def test_the_error_of_a_plane_is_in_standard_deviations_and_its_jacobians_are_ri
     rng = np.random.default_rng(seed)
     T_cw, plane_w = random_pose(rng), random_plane(rng)
     seen = shifted(plane_w.transformed(T_cw), 1e-2 * rng.standard_normal(3))
-    error = _PlaneError((0, 1), seen)
+    error = PlaneError((0, 1), seen)
     pose, landmark = gtsam.Pose3(inverse(T_cw)), gtsam.OrientedPlane3(*plane_w.normal, float(plane_w.offset_m))
 
     def at(xi: np.ndarray, turn: np.ndarray, jacobians: list[np.ndarray] | None = None) -> np.ndarray:
@@ -140,7 +142,7 @@ def test_a_plane_that_is_off_by_its_own_errors_has_their_mahalanobis_length(seed
     values = gtsam.Values()
     values.insert(0, gtsam.Pose3(inverse(T_cw)))
     values.insert(1, gtsam.OrientedPlane3(*predicted.normal, float(predicted.offset_m)))
-    found = _PlaneError((0, 1), local)(None, values, None)
+    found = PlaneError((0, 1), local)(None, values, None)
     expected = offset @ np.linalg.solve(local.covariance, offset)
     assert_allclose(found @ found, expected, rtol=0.1)
 
@@ -155,7 +157,7 @@ def test_information_speaks_of_left_perturbations_of_the_motion() -> None:
     first, second = (
         RelativePose(se3_exp(e) @ T_ji, information) for e, information in zip(errors, informations, strict=True)
     )
-    graph = PoseGraph(ClosureConfig(robust="none"))
+    graph = PoseGraph(SolvingSettings(robust="none"))
     graph.add_first(0, random_pose(rng))
     graph.add_keyframe(1, {0: first})
     graph.add_closure(0, 1, second)
@@ -172,7 +174,7 @@ def test_information_speaks_of_left_perturbations_of_the_motion() -> None:
 def test_a_closure_leaves_alone_what_it_does_not_know() -> None:
     information = np.diag([1e6, 1e6, 1e6, 1e6, 1e6, 0.0])
     step = RelativePose(se3_exp([0, 0, 0, 0, 0, -1.0]), np.diag([1e4] * 6))
-    graph = PoseGraph(ClosureConfig())
+    graph = PoseGraph(SolvingSettings())
     chain(graph, np.eye(4), [step] * 4)
     graph.add_closure(0, 4, RelativePose(se3_exp([0, 0, 0, 0.01, 0, -3.0]), information))
     found = graph.optimise().T_cw[4]
@@ -184,7 +186,7 @@ def test_information_need_not_be_in_the_frame_of_the_earlier_keyframe() -> None:
     """A motion known well along j's x axis only is known along that axis, wherever i looks."""
     T_ji = se3_exp([0.0, 1.2, 0.0, 0.0, 0.0, 0.0])
     sigma = np.array([1e-4, 1e-4, 1e-4, 1e-4, 10.0, 10.0])
-    graph = PoseGraph(ClosureConfig())
+    graph = PoseGraph(SolvingSettings())
     chain(graph, np.eye(4), [RelativePose(T_ji, np.diag(sigma**-2.0))])
     graph.optimise()
     assert_allclose(np.sqrt(np.diag(graph.relative(0, 1)[1])), sigma, rtol=0.01)
@@ -193,14 +195,14 @@ def test_information_need_not_be_in_the_frame_of_the_earlier_keyframe() -> None:
 @pytest.mark.parametrize("solver", ["incremental", "batch"])
 def test_solvers_agree(solver: str) -> None:
     truth, motions, views = simulated(ROOM, turning, 20, 0)
-    graph = PoseGraph(ClosureConfig(formulation="landmarks", solver=solver, relinearise=1e-4))
+    graph = PoseGraph(SolvingSettings(graph_solver=solver, relinearise=1e-4))
     chain(graph, truth[0], motions)
     for k, seen in enumerate(views):
         for plane_id, plane in seen.items():
             graph.add_plane_observation(k, plane_id, plane)
     found = graph.optimise()
     assert rms_m(found, truth) < 0.02
-    reference = run(ClosureConfig(formulation="landmarks", relinearise=1e-4), truth, motions, views)
+    reference = run(changed(LANDMARKS, relinearise=1e-4), truth, motions, views)
     assert_allclose(found.T_cw, reference.T_cw, atol=2e-3)
     assert_allclose(found.planes, reference.planes, atol=5e-3)
     for plane_id, plane in zip(found.plane_ids, found.planes, strict=True):
@@ -286,7 +288,7 @@ def test_a_tenth_of_sightings_wrong() -> None:
 @pytest.mark.parametrize("solver", ["incremental", "batch"])
 def test_planes_that_merge_and_end(solver: str) -> None:
     truth, motions, views = simulated(ROOM, turning, 30, 0)
-    graph = PoseGraph(ClosureConfig(formulation="landmarks", solver=solver))
+    graph = PoseGraph(SolvingSettings(graph_solver=solver))
     chain(graph, truth[0], motions)
     for k, seen in enumerate(views):
         for plane_id, plane in seen.items():
@@ -306,7 +308,7 @@ def test_planes_that_merge_and_end(solver: str) -> None:
 def test_the_first_keyframe_stays_and_others_come_back_in_order() -> None:
     rng = np.random.default_rng(0)
     first = random_pose(rng)
-    graph = PoseGraph(ClosureConfig())
+    graph = PoseGraph(SolvingSettings())
     graph.add_first(7, first)
     graph.add_keyframe(30, {7: RelativePose(random_pose(rng), 1e4 * np.eye(6))})
     graph.add_keyframe(12, {7: RelativePose(random_pose(rng), 1e4 * np.eye(6))})
@@ -318,7 +320,7 @@ def test_the_first_keyframe_stays_and_others_come_back_in_order() -> None:
 
 def test_odometry_from_several_keyframes_is_weighed() -> None:
     """Keyframe 2 is placed by the first motion given, and lands where the information of both puts it."""
-    graph = PoseGraph(ClosureConfig())
+    graph = PoseGraph(SolvingSettings())
     chain(graph, np.eye(4), [RelativePose(np.eye(4), 1e10 * np.eye(6))])
     shares = {0: 0.25, 1: 0.75}
     steps = {0: se3_exp([0, 0, 0, 0.0, 0, 0]), 1: se3_exp([0, 0, 0, 0.004, 0, 0])}
@@ -330,7 +332,7 @@ def test_odometry_from_several_keyframes_is_weighed() -> None:
 
 @pytest.mark.parametrize("solver", ["incremental", "batch"])
 def test_odometry_that_says_nothing_is_no_singular_system(solver: str) -> None:
-    graph = PoseGraph(ClosureConfig(formulation="landmarks", solver=solver))
+    graph = PoseGraph(SolvingSettings(graph_solver=solver))
     step = se3_exp([0, 0, 0, 0, 0, -1.0])
     chain(graph, np.eye(4), [RelativePose(step, np.zeros((6, 6)))] * 3)
     assert_allclose(graph.optimise().T_cw[3], np.linalg.matrix_power(step, 3), atol=1e-6)
@@ -338,7 +340,7 @@ def test_odometry_that_says_nothing_is_no_singular_system(solver: str) -> None:
 
 def test_what_cannot_be_used_is_refused_with_a_message() -> None:
     motion = RelativePose(np.eye(4), np.eye(6))
-    graph = PoseGraph(ClosureConfig())
+    graph = PoseGraph(SolvingSettings())
     with pytest.raises(GraphError, match="no keyframes"):
         graph.estimate()
     with pytest.raises(GraphError, match="keyframe 0"):
@@ -366,14 +368,14 @@ def test_what_cannot_be_used_is_refused_with_a_message() -> None:
 
 
 def test_a_singular_system_is_a_graph_error_or_solved(monkeypatch: pytest.MonkeyPatch) -> None:
-    graph = PoseGraph(ClosureConfig())
+    graph = PoseGraph(SolvingSettings())
     chain(graph, np.eye(4), [RelativePose(np.eye(4), np.eye(6))])
     graph.optimise()
 
     def fail(*arguments: object) -> None:
         raise RuntimeError("\nIndeterminant linear system detected near variable x1\n")
 
-    monkeypatch.setattr("tgslam.graph.pose_graph._Incremental.update", fail)
+    monkeypatch.setattr("tgslam.graph.solvers.Incremental.update", fail)
     with pytest.raises(GraphError, match="Indeterminant linear system"):
         graph.optimise()
     monkeypatch.undo()
@@ -382,7 +384,7 @@ def test_a_singular_system_is_a_graph_error_or_solved(monkeypatch: pytest.Monkey
 
 def test_an_estimate_that_is_lost_is_a_graph_error() -> None:
     """Infinite certainty about contradictory motions: whatever gtsam makes of it, no traceback of its own."""
-    graph = PoseGraph(ClosureConfig(robust="none"))
+    graph = PoseGraph(SolvingSettings(robust="none"))
     chain(graph, np.eye(4), [RelativePose(np.eye(4), 1e300 * np.eye(6))])
     graph.add_closure(0, 1, RelativePose(se3_exp([3.0, 0, 0, 1e6, 0, 0]), 1e300 * np.eye(6)))
     try:

@@ -6,9 +6,11 @@ import pytest
 from tests.reference import image as reference
 from tgslam.camera import Camera
 from tgslam.config.map_settings import LossConfig
+from tgslam.config.tracking_settings import ModelSettings
 from tgslam.device import runtime
 from tgslam.kernels import alignment
 from tgslam.ops import image as images
+from tgslam.ops.normals import normals_of
 from tgslam.ops.rasterize import RenderImages
 from tgslam.tracking.pyramid import LivePyramid, ModelPyramid
 from tgslam.types import Frame
@@ -57,7 +59,9 @@ def test_levels_of_a_frame_match_the_twin(size, first):
             expected_records = np.stack([depth_m, grey, *gradient, np.hypot(*gradient)], axis=-1)
             np.testing.assert_allclose(records[:, : grey.shape[1]], expected_records, atol=2e-6)
             gate = 1 - np.clip((np.hypot(*gradient) - level.gate_low) * level.gate_inverse_range, 0, 1)
-            twin = reference.texture_gate(grey, LOSS.gate_percentile, LOSS.gate_noise_floor)
+            twin = reference.texture_gate(
+                grey, LOSS.expert.texture.gate_percentile, LOSS.expert.texture.gate_noise_floor
+            )
             np.testing.assert_allclose(gate, twin, atol=1e-4)
 
 
@@ -72,7 +76,7 @@ def test_without_the_gate_every_strength_counts_as_texture():
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("first", [0, 1, 2])
 def test_levels_of_a_rendering_match_the_twin(size, first):
-    pyramid = ModelPyramid(camera_of(size), first, LEVELS, LOSS, 0.5, 0.7)
+    pyramid = ModelPyramid(camera_of(size), first, LEVELS, LOSS.noise, ModelSettings(min_opacity=0.5, rim_opacity=0.7))
     for seed in (0, 1):
         colour, depth = view(size, seed)
         opacity = np.random.default_rng(seed).uniform(0.45, 1.0, size).astype(np.float32)
@@ -92,9 +96,8 @@ def test_levels_of_a_rendering_match_the_twin(size, first):
             gx, gy = reference.sobel(grey)
             (gxx, gxy), (_, gyy) = reference.sobel(gx), reference.sobel(gy)
             np.testing.assert_allclose(texture[..., :6], np.stack([grey, gx, gy, gxx, gxy, gyy], -1), atol=2e-6)
-            normal = images.normals(
-                runtime.to_device(abs(surface[..., alignment.MODEL_DEPTH])), level.camera, 1, LOSS.depth_sigma_per_m2
-            )
+            depth_m = runtime.to_device(abs(surface[..., alignment.MODEL_DEPTH]))
+            normal = normals_of(depth_m, level.camera, LOSS.noise, radius=1)
             np.testing.assert_array_equal(surface[..., :3], runtime.to_host(normal))
 
 
@@ -107,6 +110,8 @@ def test_what_is_no_depth_is_none(value):
     pixels = runtime.to_host(level.pixels).swapaxes(2, 3).reshape(*size, alignment.LIVE)
     assert not pixels[10:20, 10:30, alignment.LIVE_DEPTH].any()
     arrays = [runtime.to_device(image) for image in (colour, depth, np.ones(size), colour)]
-    (model,) = ModelPyramid(camera_of(size), 0, 1, LOSS, 0.5, 0.7).update(RenderImages(*arrays))
+    (model,) = ModelPyramid(camera_of(size), 0, 1, LOSS.noise, ModelSettings(min_opacity=0.5, rim_opacity=0.7)).update(
+        RenderImages(*arrays)
+    )
     surface = runtime.to_host(model.surface)
     assert not surface[10:20, 10:30, alignment.MODEL_DEPTH].any() and np.isfinite(surface).all()

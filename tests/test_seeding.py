@@ -18,7 +18,7 @@ from tgslam.evaluation.image_metrics import masked_psnr
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, se3_exp, transform_points
 from tgslam.kernels import seeding as kernels
 from tgslam.mapping.insertion import Cells, cell_levels, cell_sizes, quadtree, seed
-from tgslam.ops import image as images
+from tgslam.ops.normals import normals_of
 from tgslam.ops.rasterize import Rasterizer
 from tgslam.types import Frame, Gaussians
 
@@ -325,7 +325,7 @@ def source() -> SyntheticSource:
 
 def seeded_frame(source: SyntheticSource, frame: Frame, T_cw: NDArray) -> tuple[Gaussians, Cells]:
     cells = quadtree(frame.colour, frame.depth_m, everywhere(frame.depth_m), CONFIG, NOISE)
-    normals = images.normals(frame.depth_m, source.camera, sigma_per_m2=SIGMA)
+    normals = normals_of(frame.depth_m, source.camera, NOISE)
     return seed(cells, normals, source.camera, T_cw, 7, CONFIG), cells
 
 

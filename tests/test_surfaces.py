@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from tests.test_synthetic import points_c, source
 from tgslam.geometry import transform_points
 from tgslam.kernels import procedural
-from tgslam.synthetic.primitives import plane_areas_m2, surface_distance_m
+from tgslam.synthetic.primitives import surface_distance_m
 from tgslam.synthetic.scene import Material, Scene, SceneBuilder
 
 GREY = Material(procedural.PLAIN, (0.5, 0.5, 0.5))
@@ -120,17 +120,3 @@ def test_what_the_camera_sees_is_at_the_surface(scene: str) -> None:
         towards = one.pose(index)[:3, 3] - points_w
         lifted = points_w + 0.02 * towards / np.linalg.norm(towards, axis=1, keepdims=True)
         assert (truth.surface_distance_m(lifted) <= 0.02 + 1e-4).all()
-
-
-def test_areas_of_faces() -> None:
-    builder = SceneBuilder()
-    wall = builder.quad((0, 0, 0), (1, 0, 0), (0, 1, 0), (2.0, 3.0), GREY)
-    builder.quad((0, 0, 0), (1, 0, 0), (0, 1, 0), (1.0, 1.0), GREY, painted_on=wall)
-    box = builder.box((0, 0, 1), (1.0, 2.0, 3.0), GREY)
-    builder.ellipsoid((0, 0, 1), (1.0, 2.0, 3.0), GREY)
-    cap = builder.cylinder((0, 0, 0), 0.5, 2.0, GREY)
-    areas = plane_areas_m2(builder.build(False))
-    assert areas[wall] == pytest.approx(6)
-    np.testing.assert_allclose(areas[box : box + 6], [6, 6, 3, 3, 2, 2])
-    np.testing.assert_allclose(areas[cap : cap + 2], np.pi / 4)
-    assert len(areas) == 9

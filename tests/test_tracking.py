@@ -13,11 +13,12 @@ from scipy.special import ndtr
 
 from tests.mapper import Mapper
 from tests.reference import alignment as reference
+from tests.tiers import changed
 from tgslam.camera import Camera
 from tgslam.config.input_settings import SyntheticConfig
 from tgslam.config.map_settings import LossConfig
 from tgslam.config.schema import Config
-from tgslam.config.tracking_settings import TrackingConfig
+from tgslam.config.tracking_settings import LostSettings, ModelSettings, MotionSettings, TrackingConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.device import runtime
 from tgslam.geometry import inverse, se3_exp, se3_log
@@ -30,13 +31,14 @@ from tgslam.tracking.gauss_newton import GaussNewtonTracker
 from tgslam.tracking.lost import LostDetector
 from tgslam.tracking.motion import MotionFilter
 from tgslam.tracking.pyramid import LiveLevel, LivePyramid, ModelLevel, ModelPyramid, finest_level
-from tgslam.tracking.reference import NO_PLANES, Reference, references_of
+from tgslam.tracking.references import NO_PLANES, Reference, references_of
 from tgslam.tracking.result import TrackingResult
 from tgslam.tracking.solver import make_tracker, track_or_recover
 from tgslam.types import Exposure, Frame
 
 CONFIG = TrackingConfig()
-PATIENT = replace(CONFIG, solver="first_order", first_order_iterations=(60, 60), first_order_rate=0.002)
+RESIDUALS, HANDS = CONFIG.expert.residuals, MotionSettings()
+PATIENT = changed(CONFIG, solver="first_order", adam_steps=(60, 60), adam_rate=0.002)
 CASES = [("room", 30), ("room", 120), ("blank", 30), ("blank", 120)]
 
 
@@ -103,7 +105,7 @@ def test_first_order_finds_the_next_frames_given_time(scene, noise):
 
 def test_first_order_with_default_steps_gains_on_the_prediction():
     one, gaussians = source("room"), map_of("room", 30)
-    config = replace(CONFIG, solver="first_order")
+    config = changed(CONFIG, solver="first_order")
     result = tracker(config).track(one.read(32), gaussians, inverse(one.pose(30)), Exposure())
     assert error(result.T_cw, one.pose(32))[0] < 0.5 * error(inverse(one.pose(30)), one.pose(32))[0]
 
@@ -130,12 +132,12 @@ def test_first_order_converges_from_one_degree_and_a_centimetre():
 def test_another_render_at_the_estimate_does_no_harm():
     one, gaussians = source("room"), map_of("room", 30)
     start = off_by(2.0, 0.03, 0) @ inverse(one.pose(32))
-    twice = tracker(replace(CONFIG, renders=2)).track(one.read(32), gaussians, start, Exposure())
+    twice = tracker(changed(CONFIG, renders=2)).track(one.read(32), gaussians, start, Exposure())
     angle_deg, distance_mm = error(twice.T_cw, one.pose(32))
     assert angle_deg < 0.05 and distance_mm < 1.5
 
 
-@pytest.mark.parametrize("config", [CONFIG, replace(CONFIG, solver="first_order")])
+@pytest.mark.parametrize("config", [CONFIG, changed(CONFIG, solver="first_order")])
 def test_tracking_repeats_bit_for_bit(config):
     one, gaussians = source("room", True), map_of("room", 30, True)
     first, again = (
@@ -153,7 +155,7 @@ def test_large_images_are_aligned_at_a_lower_resolution():
     large = Camera(2 * TINY.width, 2 * TINY.height, 2 * TINY.fx, 2 * TINY.fy, 2 * TINY.cx + 0.5, 2 * TINY.cy + 0.5)
     assert large.halved() == TINY
     scene = Planes((WALL, SIDE, FLOOR), 0.3, large)
-    half = exact_tracker(scene, replace(CONFIG, finest_width_px=TINY.width))
+    half = exact_tracker(scene, changed(CONFIG, finest_width_px=TINY.width))
     result = half.track(scene.frame(MOTION), None, np.eye(4), Exposure())
     angle_deg, distance_mm = error(result.T_cw, inverse(MOTION))
     assert not result.lost and angle_deg < 0.03 and distance_mm < 1.5
@@ -163,7 +165,7 @@ def test_large_images_are_aligned_at_a_lower_resolution():
 def test_a_lower_resolution_does_not_draw_the_pose(scene):
     """Splats rendered small reach over edges; rendered at full size they do not."""
     one, gaussians = source(scene), map_of(scene, 30)
-    half = tracker(replace(CONFIG, finest_width_px=80, iterations=(6, 8)))
+    half = tracker(changed(CONFIG, finest_width_px=80, alignment_steps=(6, 8)))
     result = half.track(one.read(32), gaussians, inverse(one.pose(30)), Exposure())
     angle_deg, distance_mm = error(result.T_cw, one.pose(32))
     assert not result.lost and angle_deg < 0.05 and distance_mm < 2.0
@@ -190,19 +192,19 @@ def test_the_gain_of_a_frame_is_found_and_the_pose_does_not_suffer(gain):
 def test_gain_and_bias_are_found_together():
     """Up to what a rendered model's lost contrast adds to both, which a frame of gain 1 shows."""
     one, gaussians = source("room"), map_of("room", 30)
-    both, start = tracker(replace(CONFIG, exposure="gain_bias")), inverse(one.pose(30))
+    both, start = tracker(changed(CONFIG, exposure="gain_bias")), inverse(one.pose(30))
     plain = both.track(one.read(32), gaussians, start, Exposure()).exposure
     assert plain.gain == pytest.approx(1.0, abs=0.04) and plain.bias == pytest.approx(0.0, abs=0.02)
-    changed = both.track(with_exposure(one.read(32), 0.8, 0.05), gaussians, start, Exposure()).exposure
-    assert changed.gain == pytest.approx(plain.gain / 0.8, rel=2e-3)
-    assert changed.bias == pytest.approx(plain.bias - plain.gain / 0.8 * 0.05, abs=2e-3)
+    dimmed = both.track(with_exposure(one.read(32), 0.8, 0.05), gaussians, start, Exposure()).exposure
+    assert dimmed.gain == pytest.approx(plain.gain / 0.8, rel=2e-3)
+    assert dimmed.bias == pytest.approx(plain.bias - plain.gain / 0.8 * 0.05, abs=2e-3)
 
 
 @pytest.mark.parametrize("solver", ["gauss_newton", "first_order"])
 @pytest.mark.parametrize("model", ["none", "gain", "gain_bias"])
 def test_only_what_the_exposure_model_names_is_fitted(solver, model):
     one, gaussians = source("room"), map_of("room", 30)
-    config = replace(CONFIG, solver=solver, exposure=model)
+    config = changed(CONFIG, solver=solver, exposure=model)
     frame = with_exposure(one.read(31), 0.95, 0.02)
     found = tracker(config).track(frame, gaussians, inverse(one.pose(30)), Exposure()).exposure
     assert (found.gain != 1.0) == (model != "none")
@@ -359,7 +361,7 @@ def forward_m(config: TrackingConfig, *keyframes: tuple[np.ndarray, float]) -> f
         Reference(frame.colour, frame.depth_m + np.float32(off_m), T_cw, Exposure())
         for frame, T_cw, off_m in ((scene.frame(T_cw), T_cw, off_m) for T_cw, off_m in keyframes)
     ]
-    tracker = exact_tracker(scene, replace(config, weight_colour=0.0, weight_gradient=0.0))
+    tracker = exact_tracker(scene, changed(config, weight_colour=0.0, weight_gradient=0.0))
     tracker.know(NO_PLANES, references)
     return float((MOTION @ inverse(tracker.track(scene.frame(MOTION), None, np.eye(4), Exposure()).T_cw))[2, 3])
 
@@ -372,7 +374,7 @@ def test_keyframes_count_alike_as_many_as_are_used():
     first, second, third = NEARBY
     off = forward_m(CONFIG, (first, Farther.OFF_M))
     assert off == pytest.approx(Farther.OFF_M, rel=0.2)
-    both = replace(CONFIG, references=2)
+    both = changed(CONFIG, references=2)
     assert forward_m(both, (first, Farther.OFF_M), (second, 0.0)) == pytest.approx(off / 2, rel=0.05)
     exact = forward_m(both, (first, 0.0), (second, 0.0), (third, Farther.OFF_M))
     assert exact == forward_m(both, (first, 0.0), (second, 0.0))
@@ -498,8 +500,8 @@ class Explored(Planes):
 def test_the_rim_of_the_map_does_not_draw_the_pose():
     scene = Explored((WALL,), contrast=0.2)
     off_mm = []
-    for rim_opacity in (0.0, CONFIG.rim_opacity):
-        one = exact_tracker(scene, replace(CONFIG, rim_opacity=rim_opacity))
+    for rim_opacity in (0.0, ModelSettings().rim_opacity):
+        one = exact_tracker(scene, changed(CONFIG, rim_opacity=rim_opacity))
         off_mm.append(error(one.track(scene.frame(MOTION), None, np.eye(4), Exposure()).T_cw, inverse(MOTION))[1])
     assert off_mm[1] < 10.0 < 0.1 * off_mm[0]
 
@@ -525,25 +527,25 @@ def test_the_information_is_how_the_cost_grows_with_the_pose():
     scene = Planes((WALL, SIDE, FLOOR), contrast=0.3)
     T_mw = se3_exp([0.03, -0.06, 0.05, 0.12, -0.08, 0.1])
     frame = scene.frame(MOTION)
-    config = replace(CONFIG, surface_sigma_m=0.0)  # the more depth weighs, the less creases and borders matter
+    config = changed(CONFIG, surface_sigma_m=0.0)  # the more depth weighs, the less creases and borders matter
     result = exact_tracker(scene, config).track(frame, None, T_mw, Exposure())
     loss = LossConfig()
     live = live_images(LivePyramid(TINY, 0, 1, loss).update(frame)[0])
-    model = model_images(
-        ModelPyramid(TINY, 0, 1, loss, CONFIG.min_opacity, CONFIG.rim_opacity).update(scene.forward(None, T_mw))[0]
-    )
+    model = model_images(ModelPyramid(TINY, 0, 1, loss.noise, ModelSettings()).update(scene.forward(None, T_mw))[0])
     settings = reference.Settings(
         TINY.fx, TINY.fy, TINY.cx, TINY.cy, result.exposure.gain, result.exposure.bias,
-        loss.depth_sigma_per_m2, CONFIG.max_distance_sigmas, loss.charbonnier_depth_sigmas, loss.gate_depth_boost,
-        CONFIG.sigma_colour, CONFIG.sigma_gradient, CONFIG.weight_depth, CONFIG.weight_colour, CONFIG.weight_gradient,
-        config.surface_sigma_m, 0.0,
+        loss.depth_sigma_per_m2, RESIDUALS.max_distance_sigmas,
+        loss.expert.penalties.charbonnier_depth_sigmas, loss.expert.texture.gate_depth_boost,
+        RESIDUALS.sigma_colour, RESIDUALS.sigma_gradient,
+        RESIDUALS.weight_depth, RESIDUALS.weight_colour, RESIDUALS.weight_gradient,
+        config.expert.residuals.surface_sigma_m, 0.0,
     )  # fmt: skip
     assert len(fields(settings)) == 17
 
     def cost(xi: np.ndarray) -> float:
         return reference.cost(settings, T_mw @ inverse(se3_exp(xi) @ result.T_cw), live, model)
 
-    information = CONFIG.correlated_px * result.information  # as if every pixel spoke for itself
+    information = RESIDUALS.correlated_px * result.information  # as if every pixel spoke for itself
     for way in np.eye(6)[[0, 2, 4, 5]]:
         step = way / np.sqrt(way @ information @ way) * 12.0  # a small part of a sigma for each pixel
         growth = cost(step) + cost(-step) - 2 * cost(np.zeros(6))
@@ -594,14 +596,14 @@ GOOD = {"overlap": 0.9, "agreement": 0.98, "inlier_ratio": 0.9, "colour_residual
     ],
 )
 def test_evidence_names_what_is_wrong(change, word):
-    assert LostDetector(CONFIG).judge(GOOD) == ""
-    assert word in LostDetector(CONFIG).judge(GOOD | change)
+    assert LostDetector(LostSettings()).judge(GOOD) == ""
+    assert word in LostDetector(LostSettings()).judge(GOOD | change)
 
 
 def test_colours_far_worse_than_they_were_are_suspect():
-    detector = LostDetector(CONFIG)
+    detector = LostDetector(LostSettings())
     assert detector.judge(GOOD | {"colour_residual": 0.2}) == ""  # nothing is known yet of what is usual
-    detector = LostDetector(CONFIG)
+    detector = LostDetector(LostSettings())
     for _ in range(5):
         assert detector.judge(GOOD | {"colour_residual": 0.02}) == ""
     assert detector.judge(GOOD | {"colour_residual": 0.055}) == ""  # less than three times the usual
@@ -610,16 +612,16 @@ def test_colours_far_worse_than_they_were_are_suspect():
 
 
 def test_a_small_colour_residual_is_never_suspect():
-    detector = LostDetector(CONFIG)
+    detector = LostDetector(LostSettings())
     for _ in range(5):
         assert detector.judge(GOOD | {"colour_residual": 0.001}) == ""
     assert detector.judge(GOOD | {"colour_residual": 0.035}) == ""
 
 
 def test_thresholds_are_the_configs():
-    lenient = replace(CONFIG, lost_overlap=0.01, lost_inlier_ratio=0.0, lost_condition=1e12)
+    lenient = LostSettings(min_map_overlap=0.01, min_inlier_ratio=0.0, max_condition=1e12)
     assert LostDetector(lenient).judge(GOOD | {"overlap": 0.02, "inlier_ratio": 0.01, "condition": 1e10}) == ""
-    strict = replace(CONFIG, lost_overlap=0.95)
+    strict = LostSettings(min_map_overlap=0.95)
     assert "meets the map" in LostDetector(strict).judge(GOOD)
 
 
@@ -644,7 +646,7 @@ KINDS = ["twice as far", "half as far", "a hand on the lens", "noise", "no depth
 @pytest.mark.parametrize("solver", ["gauss_newton", "first_order"])
 def test_an_unrelated_frame_is_lost_and_the_message_says_why(kind, scene, solver):
     one, gaussians = source(scene, True), map_of(scene, 30, True)
-    config = replace(CONFIG, solver=solver, first_order_iterations=(4, 4))
+    config = changed(CONFIG, solver=solver, adam_steps=(4, 4))
     result = tracker(config).track(unrelated(kind, one.read(31)), gaussians, inverse(one.pose(30)), Exposure())
     assert result.lost
     assert "meets the map" in result.message or "three sigma" in result.message
@@ -654,7 +656,7 @@ def test_an_unrelated_frame_is_lost_and_the_message_says_why(kind, scene, solver
 @pytest.mark.parametrize("solver", ["gauss_newton", "first_order"])
 def test_an_empty_map_loses_every_frame(solver):
     one = source("room")
-    config = replace(CONFIG, solver=solver, first_order_iterations=(2, 2))
+    config = changed(CONFIG, solver=solver, adam_steps=(2, 2))
     result = tracker(config).track(one.read(0), GaussianMap(), np.eye(4), Exposure())
     assert result.lost and "meets the map" in result.message
     assert result.measures["overlap"] == 0.0
@@ -730,7 +732,7 @@ EXACT = 1e14 * np.eye(6)  # the information of poses without noise
 
 
 def test_without_a_past_nothing_moves():
-    motion = MotionFilter(CONFIG)
+    motion = MotionFilter(HANDS)
     np.testing.assert_array_equal(motion.predict(5.0), np.eye(4))
     motion.update(5.0, START, EXACT)
     np.testing.assert_allclose(motion.predict(9.0), START, atol=1e-12)
@@ -738,7 +740,7 @@ def test_without_a_past_nothing_moves():
 
 @pytest.mark.parametrize("times_s", [(0.0, 0.1, 0.2), (0.0, 0.03, 0.5), (7.0, 7.9, 7.95)])
 def test_a_steady_motion_is_foretold_at_any_time(times_s):
-    motion = MotionFilter(CONFIG)
+    motion = MotionFilter(HANDS)
     for time_s in times_s[:2]:
         motion.update(time_s, moved(time_s), EXACT)
     np.testing.assert_allclose(motion.predict(times_s[2]), moved(times_s[2]), atol=1e-9)
@@ -746,7 +748,7 @@ def test_a_steady_motion_is_foretold_at_any_time(times_s):
 
 
 def test_equal_or_earlier_timestamps_keep_the_velocity():
-    motion = MotionFilter(CONFIG)
+    motion = MotionFilter(HANDS)
     motion.update(0.0, moved(0.0), EXACT)
     motion.update(0.1, moved(0.1), EXACT)
     for time_s in (0.1, 0.05):
@@ -755,15 +757,15 @@ def test_equal_or_earlier_timestamps_keep_the_velocity():
 
 
 def test_the_prediction_is_trusted_but_for_what_hands_do_and_less_without_a_velocity():
-    motion = MotionFilter(CONFIG)
+    motion = MotionFilter(HANDS)
     assert not motion.information(3.0).any()
     motion.update(3.0, START, EXACT)
     unknown = motion.information(3.1)
     motion.update(3.1, moved(0.1), EXACT)
     for elapsed_s in (0.03, 0.1, 1.0):
         sigmas = np.diag(motion.information(3.1 + elapsed_s)) ** -0.5
-        np.testing.assert_allclose(sigmas[:3], CONFIG.acceleration_rad * elapsed_s**2, rtol=1e-3)
-        np.testing.assert_allclose(sigmas[3:], CONFIG.acceleration_m * elapsed_s**2, rtol=1e-3)
+        np.testing.assert_allclose(sigmas[:3], HANDS.acceleration_rad * elapsed_s**2, rtol=1e-3)
+        np.testing.assert_allclose(sigmas[3:], HANDS.acceleration_m * elapsed_s**2, rtol=1e-3)
     assert (np.diag(unknown) < 0.9 * np.diag(motion.information(3.2))).all()
     assert np.isfinite(motion.information(3.1)).all() and np.isfinite(motion.information(2.0)).all()
     motion.coast(3.2, moved(0.2))
@@ -779,16 +781,16 @@ def test_velocity_is_what_all_poses_say_of_it_by_their_uncertainties():
     measured_m = np.concatenate([[0.0], 0.4 * dt * np.arange(1, count) + rng.normal(0.0, 0.006, count - 1)])
     weights = rng.uniform(0.5, 2.0, count) * 0.006**-2
     weights[15:] = 1.0  # all but unseen from here on
-    motion, T_cw = MotionFilter(CONFIG), np.eye(4)
+    motion, T_cw = MotionFilter(HANDS), np.eye(4)
     motion.update(0.0, T_cw.copy(), EXACT)
     for k in range(1, count):  # as a tracker fuses what it sees with the prediction
         predicted_m, trust = motion.predict(k * dt)[0, 3], motion.information(k * dt)[3, 3]
         T_cw[0, 3] = (trust * predicted_m + weights[k] * measured_m[k]) / (trust + weights[k])
         motion.update(k * dt, T_cw.copy(), np.diag([1e6, 1e6, 1e6, weights[k], 1e6, 1e6]))
     # unknown: the velocity before each frame but the first, where it is 0 +- speed_m; x_k is what they have added up to
-    rows, sides = [np.eye(count - 1)[0] / CONFIG.speed_m], [0.0]
-    jump = CONFIG.acceleration_m * dt
-    rows[0] /= np.hypot(1.0, jump / CONFIG.speed_m)  # it may have changed before the first step, too
+    rows, sides = [np.eye(count - 1)[0] / HANDS.speed_m], [0.0]
+    jump = HANDS.acceleration_m * dt
+    rows[0] /= np.hypot(1.0, jump / HANDS.speed_m)  # it may have changed before the first step, too
     for k in range(1, count - 1):
         rows.append((np.eye(count - 1)[k] - np.eye(count - 1)[k - 1]) / jump)
         sides.append(0.0)
@@ -806,7 +808,7 @@ def test_velocity_is_what_all_poses_say_of_it_by_their_uncertainties():
 
 
 def test_a_world_that_moves_takes_the_prediction_with_it_and_not_the_velocity():
-    motion, correction = MotionFilter(CONFIG), se3_exp([0.1, 0.2, -0.1, 0.3, 0.0, 0.4])
+    motion, correction = MotionFilter(HANDS), se3_exp([0.1, 0.2, -0.1, 0.3, 0.0, 0.4])
     motion.move(correction)
     motion.update(0.0, moved(0.0), EXACT)
     motion.update(0.1, moved(0.1), EXACT)
@@ -826,7 +828,7 @@ def test_a_prior_holds_the_directions_in_which_pixels_say_little_and_no_others()
 
 
 def test_coasting_halves_the_motion_each_time():
-    motion = MotionFilter(CONFIG)
+    motion = MotionFilter(HANDS)
     motion.update(0.0, moved(0.0), EXACT)
     motion.update(1.0, moved(1.0), EXACT)
     motion.coast(1.0, moved(1.0))

@@ -30,4 +30,4 @@ def graph_closing(camera: Camera, config: Config) -> GraphClosing | None:
         raise ConfigError("closures.enabled needs planes: set planes.enabled=true as well")
     from tgslam.graph.closing import GraphClosing
 
-    return GraphClosing(camera, config.loss.depth_sigma_per_m2, config.closures, config.loops)
+    return GraphClosing(camera, config.loss.noise, config.closures, config.loops)

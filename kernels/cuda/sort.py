@@ -12,7 +12,7 @@ from tgslam.kernels.warp import ALL, WARP
 
 nd = ti.types.ndarray
 
-DIGIT_BITS = 8
+DIGIT_BITS = 8  # as many digits as a block has threads
 DIGITS = 1 << DIGIT_BITS  # one for each thread of a block
 
 

@@ -32,18 +32,19 @@ def gradient_length_penalty(difference, epsilon):
 
 def parts(colour, depth, opacity, gt, gain, bias, config, min_opacity=0.0):
     """gt: dict of float64 colour, depth, mask and gate (T)."""
+    penalties, boost = config.expert.penalties, config.expert.texture.gate_depth_boost
     mask = gt["mask"] * (opacity >= min_opacity)
     y = luminance(gt["colour"])
     x = y + mask * (gain * luminance(colour) + bias - y)
     inner = np.zeros_like(mask)
     inner[BORDER:-BORDER, BORDER:-BORDER] = mask[BORDER:-BORDER, BORDER:-BORDER]
     texture = 1 - gt["gate"]
-    measured = (gt["depth"] > 0) & (opacity > config.min_depth_opacity)
+    measured = (gt["depth"] > 0) & (opacity > penalties.min_depth_opacity)
     sigma = config.depth_sigma_per_m2 * np.where(measured, gt["depth"], 1) ** 2
     residual = (depth / np.where(measured, opacity, 1) - gt["depth"]) / sigma
-    geo = (1 + config.gate_depth_boost * gt["gate"]) * charbonnier(residual, config.charbonnier_depth_sigmas)
-    l1 = charbonnier(gain * colour + bias - gt["colour"], config.charbonnier_colour).mean(axis=2)
-    grad = texture * gradient_length_penalty(x - y, config.charbonnier_grad)
+    geo = (1 + boost * gt["gate"]) * charbonnier(residual, penalties.charbonnier_depth_sigmas)
+    l1 = charbonnier(gain * colour + bias - gt["colour"], penalties.charbonnier_colour).mean(axis=2)
+    grad = texture * gradient_length_penalty(x - y, penalties.charbonnier_grad)
     return {
         "l1": _mean(l1, mask),
         "grad": _mean(grad, inner),

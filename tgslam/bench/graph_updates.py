@@ -47,7 +47,7 @@ class _Step:
     seen: dict[int, PlaneEstimate]
 
 
-def measure(sizes: list[Size], config: ClosureConfig, step: Callable[[str], None]) -> list[dict[str, Any]]:
+def measure(sizes: list[Size], step: Callable[[str], None]) -> list[dict[str, Any]]:
     """Each size in a process of its own, so that its memory is known. step: told of each as it begins.
 
     Raises EvaluationError when one fails; it has said why on stderr.
@@ -55,8 +55,7 @@ def measure(sizes: list[Size], config: ClosureConfig, step: Callable[[str], None
     reports = []
     for size in sizes:
         step(f"{size.keyframes} keyframes")
-        arguments = json.dumps([vars(size), vars(config)])
-        command = [sys.executable, "-m", "tgslam.bench.graph_updates", arguments]
+        command = [sys.executable, "-m", "tgslam.bench.graph_updates", json.dumps(vars(size))]
         done = subprocess.run(command, env=child_environment(), stdout=subprocess.PIPE, text=True, check=False)
         if done.returncode:
             raise EvaluationError(f"the graph of {size.keyframes} keyframes ended with exit code {done.returncode}")
@@ -64,17 +63,18 @@ def measure(sizes: list[Size], config: ClosureConfig, step: Callable[[str], None
     return reports
 
 
-def _measure_here(size: Size, config: ClosureConfig) -> dict[str, Any]:
-    """Updates of a growing graph; the estimate is read after each."""
+def _measure_here(size: Size) -> dict[str, Any]:
+    """Updates of a growing graph under the default settings; the estimate is read after each."""
     from tgslam.graph.pose_graph import PoseGraph
 
-    graph, times_s = PoseGraph(config), []
+    config = ClosureConfig().expert
+    graph, times_s = PoseGraph(config.solving), []
     for k, added in enumerate(_steps(size)):
         start = time.perf_counter(), time.process_time()
         if added.motion is None:
             graph.add_first(k, added.T_cw)
         else:
-            motion = added.motion.widened(config.odometry_sigma_rad, config.odometry_sigma_m)
+            motion = added.motion.widened(config.evidence.odometry_sigma_rad, config.evidence.odometry_sigma_m)
             graph.add_keyframe(k, {k - 1: motion})
         for plane_id, plane in added.seen.items():
             graph.add_plane_observation(k, plane_id, plane)
@@ -129,5 +129,4 @@ def _position(size: Size) -> Vector:
 
 
 if __name__ == "__main__":
-    size, config = json.loads(sys.argv[1])
-    print(json.dumps(_measure_here(Size(**size), ClosureConfig(**config))))
+    print(json.dumps(_measure_here(Size(**json.loads(sys.argv[1])))))

@@ -91,7 +91,7 @@ def back_projected(frame: Frame, camera: Camera, stride: int) -> Gaussians:
     std_m = STD_PER_SPACING * stride * z / np.float32(camera.fx)
     n = len(z)
     return Gaussians(
-        mean=np.stack([(u - camera.cx) * z / camera.fx, (v - camera.cy) * z / camera.fy, z], -1).astype(np.float32),
+        mean=camera.points_at(u, v, z).astype(np.float32),
         log_scale=np.repeat(np.log(std_m)[:, None], 3, 1).astype(np.float32),
         quat_wxyz=np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (n, 1)),
         opacity_logit=np.full(n, np.log(OPACITY / (1.0 - OPACITY)), np.float32),
@@ -104,12 +104,8 @@ def back_projected(frame: Frame, camera: Camera, stride: int) -> Gaussians:
 
 def image_gradient(camera: Camera) -> ImageGradient:
     """Fixed random numbers for dL/dcolour and dL/ddepth, so that no pair is without work; none for opacity."""
-    g: NDArray[np.float32] = (
-        np.random.default_rng(_SEED).normal(size=(camera.height, camera.width, 4)).astype(np.float32)
-    )
-    return ImageGradient(
-        runtime.to_device(g[..., :3]), runtime.to_device(g[..., 3]), runtime.zeros((camera.height, camera.width))
-    )
+    g: NDArray[np.float32] = np.random.default_rng(_SEED).normal(size=(*camera.shape, 4)).astype(np.float32)
+    return ImageGradient(runtime.to_device(g[..., :3]), runtime.to_device(g[..., 3]), runtime.zeros(camera.shape))
 
 
 def _size(image: NDArray) -> str:

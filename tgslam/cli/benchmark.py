@@ -305,11 +305,10 @@ def _measure_run(args: argparse.Namespace) -> dict[str, Any]:
 def _measure_graph(args: argparse.Namespace) -> dict[str, Any]:
     from tgslam.bench import graph_updates as graph
     from tgslam.bench import report
-    from tgslam.config.graph_settings import ClosureConfig
 
     sizes = [graph.Size(keyframes, args.planes, args.sightings) for keyframes in args.keyframes]
     with step_progress("graph", len(sizes), error_console(), args.quiet) as step:
-        cases = graph.measure(sizes, ClosureConfig(), step)
+        cases = graph.measure(sizes, step)
     return {"benchmark": "graph", "machine": report.machine(), "cases": cases}
 
 

@@ -19,6 +19,7 @@ from typing import Any
 import yaml
 
 from tgslam.config.schema import Config
+from tgslam.config.setting import allowed, settings_of
 from tgslam.config.yaml_text import YamlTextError, parse_yaml, to_yaml
 from tgslam.errors import ConfigError
 
@@ -161,54 +162,27 @@ def _apply(section: Any, mapping: Mapping[Any, Any], where: str, prefix: str) ->
 
 
 def _advice(section: Any, name: str, prefix: str) -> str:
-    """The nearest valid key with what it allows: in this section, else anywhere."""
-    settings = dict(_settings_of(Config(), ""))
+    """The nearest valid key with what it allows: one of that very name, else in this section, else anywhere."""
+    settings = dict(settings_of(Config()))
+    known = [*settings, *dict.fromkeys(parent for key in settings for parent in _sections_of(key))]
     here = [field.name for field in dataclasses.fields(section)]
-    near = [prefix + match for match in difflib.get_close_matches(name, here, n=1)]
-    near = near or [key for key in settings if key.rpartition(".")[2] == name]
-    near = near or difflib.get_close_matches(prefix + name, settings, n=1)
+    near = [key for key in known if key.rpartition(".")[2] == name]
+    near.sort(key=lambda key: not key.startswith(prefix))
+    near = near or [prefix + match for match in difflib.get_close_matches(name, here, n=1)]
+    if not near:
+        leaves = {key.rpartition(".")[2]: key for key in settings}
+        near = [leaves[match] for match in difflib.get_close_matches(name, leaves, n=1)]
     if not near:
         return f"; valid here are: {', '.join(here)}"
     if near[0] in settings:
-        return f"; did you mean `{near[0]}` ({_allowed(*settings[near[0]])})?"
+        return f"; did you mean `{near[0]}` ({allowed(*settings[near[0]])})?"
     return f"; did you mean the section `{near[0]}`?"
 
 
-def _settings_of(section: Any, prefix: str) -> Iterator[tuple[str, tuple[Any, dataclasses.Field[Any]]]]:
-    """(dotted key, (type, field)) of every setting below `section`."""
-    hints = typing.get_type_hints(type(section))
-    for field in dataclasses.fields(section):
-        if dataclasses.is_dataclass(hints[field.name]):
-            yield from _settings_of(getattr(section, field.name), f"{prefix}{field.name}.")
-        else:
-            yield prefix + field.name, (hints[field.name], field)
-
-
-def _allowed(hint: Any, field: dataclasses.Field[Any]) -> str:
-    """What a setting takes, in words: "a whole number from 2 to 1000"."""
-    choices = field.metadata.get("choices")
-    if choices:
-        return "one of " + ", ".join(choices)
-    low, high = field.metadata.get("low"), field.metadata.get("high")
-    bounds = ""
-    if low is not None and high is not None:
-        bounds = f" from {low} to {high}"
-    elif low is not None:
-        bounds = f" of {low} or more"
-    elif high is not None:
-        bounds = f" of {high} or less"
-    return _type_in_words(hint) + bounds
-
-
-def _type_in_words(hint: Any) -> str:
-    if typing.get_origin(hint) is tuple:
-        elements = typing.get_args(hint)
-        length = "" if elements[-1] is Ellipsis else f"{len(elements)} values, "
-        return f"a list ({length}each {_type_in_words(elements[0])})"
-    if isinstance(hint, types.UnionType):
-        return " or ".join(_type_in_words(option) for option in typing.get_args(hint))
-    words = {bool: "true or false", int: "a whole number", float: "a number", str: "text", type(None): "null"}
-    return words[hint]
+def _sections_of(key: str) -> list[str]:
+    """The sections that a setting is in: tracking, tracking.expert, tracking.expert.lost."""
+    names = key.split(".")[:-1]
+    return [".".join(names[: count + 1]) for count in range(len(names))]
 
 
 def _checked(hint: Any, field: dataclasses.Field[Any], value: Any, where: str, key: str) -> Any:
@@ -216,21 +190,21 @@ def _checked(hint: Any, field: dataclasses.Field[Any], value: Any, where: str, k
     shown = value
     if isinstance(value, _Text):
         value = _value_of_text(hint, value, where)
-    allowed = _allowed(hint, field)
+    wanted = allowed(hint, field)
     try:
         result = _converted(hint, value)
     except (TypeError, OverflowError):
-        raise ConfigError(f"{where}: `{key}` = {_short(shown)} must be {allowed}") from None
+        raise ConfigError(f"{where}: `{key}` = {_short(shown)} must be {wanted}") from None
     low, high, choices = (field.metadata.get(name) for name in ("low", "high", "choices"))
     if isinstance(result, tuple) and len(result) < field.metadata.get("min_items", 0):
-        raise ConfigError(f"{where}: `{key}` = {_short(shown)} is too short: it must be {allowed}")
+        raise ConfigError(f"{where}: `{key}` = {_short(shown)} is too short: it must be {wanted}")
     for item in result if isinstance(result, tuple) else (result,):
         if item is None:
             continue
         if choices and item not in choices:
-            raise ConfigError(f"{where}: `{key}` = {_short(shown)} must be {allowed}")
+            raise ConfigError(f"{where}: `{key}` = {_short(shown)} must be {wanted}")
         if (low is not None and item < low) or (high is not None and item > high):
-            raise ConfigError(f"{where}: `{key}` = {_short(shown)} is out of range: it must be {allowed}")
+            raise ConfigError(f"{where}: `{key}` = {_short(shown)} is out of range: it must be {wanted}")
     return result
 
 

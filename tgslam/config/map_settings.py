@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from tgslam.camera import SensorNoise
 from tgslam.config.setting import setting
@@ -59,33 +59,60 @@ class MappingConfig:
 
 
 @dataclass(frozen=True)
+class TextureGateSettings:
+    """How much texture a pixel has to have for its colour to count (Eqs. 10, 11)."""
+
+    gate_percentile: float = setting(
+        95.0, 50.0, 100.0, doc="G_max of Eq. 11 is this percentile of the gradient magnitude; G_min mirrors it."
+    )
+    gate_noise_floor: float = setting(
+        0.01, 1e-6, 1.0, doc="epsilon of Eq. 11: weaker gradients are noise, intensity per px."
+    )
+    gate_depth_boost: float = setting(1.0, 0.0, 100.0, doc="Depth residuals are weighted by 1 + this * T.")
+
+
+@dataclass(frozen=True)
+class PenaltySettings:
+    """The Charbonnier penalties of the objective's parts, and where depth counts."""
+
+    charbonnier_colour: float = setting(0.02, 1e-6, 1.0, doc="epsilon of colour, intensity in [0, 1].")
+    charbonnier_grad: float = setting(0.01, 1e-6, 1.0, doc="epsilon of gradients, intensity per px.")
+    charbonnier_depth_sigmas: float = setting(
+        1.0, 1e-3, 100.0, doc="epsilon of depth, in standard deviations of the sensor's noise."
+    )
+    min_depth_opacity: float = setting(0.5, 0.01, 1.0, doc="Rendered depth counts above this opacity.")
+
+
+@dataclass(frozen=True)
+class LossExpert:
+    """What needs knowledge of the algorithm to be turned."""
+
+    texture: TextureGateSettings = field(default_factory=TextureGateSettings)
+    penalties: PenaltySettings = field(default_factory=PenaltySettings)
+
+
+@dataclass(frozen=True)
 class LossConfig:
     """The adaptive RGB-depth objective, Eqs. 10-13."""
 
     gate: bool = setting(
-        True, doc="False: T = 0 everywhere, and no term of the objective asks how much texture there is"
+        True, doc="Colour counts by how much texture a pixel has (Eq. 11). Off: T = 0 everywhere, and all count alike."
     )
-    gate_percentile: float = setting(
-        95.0, 50.0, 100.0, doc="G_max of Eq. 11 is this percentile of the gradient magnitude"
+    depth_sigma_per_m2: float = setting(
+        0.0015, 1e-6, 1.0, doc="The sensor's noise: the standard deviation of a depth z is this * z^2; 1/m."
     )
-    gate_noise_floor: float = setting(
-        0.01, 1e-6, 1.0, doc="epsilon of Eq. 11, intensity per px: weaker gradients are noise"
-    )
-    gate_depth_boost: float = setting(1.0, 0.0, 100.0, doc="depth residuals are weighted by 1 + this * T")
-    min_depth_opacity: float = setting(0.5, 0.01, 1.0, doc="rendered depth counts above this opacity")
-    charbonnier_colour: float = setting(0.02, 1e-6, 1.0, doc="epsilon, intensity in [0, 1]")
-    charbonnier_grad: float = setting(0.01, 1e-6, 1.0, doc="epsilon, intensity per px")
-    charbonnier_depth_sigmas: float = setting(
-        1.0, 1e-3, 100.0, doc="epsilon, in standard deviations of the depth noise"
-    )
-    depth_sigma_per_m2: float = setting(0.0015, 1e-6, 1.0, doc="sensor noise: sigma_z = this * z^2, 1/m")
-    weight_l1: float = setting(1.0, 0.0, 100.0)
-    weight_grad: float = setting(0.5, 0.0, 100.0)
-    weight_ssim: float = setting(0.2, 0.0, 100.0)
-    weight_pho: float = setting(1.0, 0.0, 100.0, doc="lambda_pho of Eq. 14")
+    weight_l1: float = setting(1.0, 0.0, 100.0, doc="Weight of colour in E_pho.")
+    weight_grad: float = setting(0.5, 0.0, 100.0, doc="Weight of gradients in E_pho.")
+    weight_ssim: float = setting(0.2, 0.0, 100.0, doc="Weight of structural similarity in E_pho.")
+    weight_pho: float = setting(1.0, 0.0, 100.0, doc="lambda_pho of Eq. 14: weight of E_pho.")
     weight_geo: float = setting(
-        0.02, 0.0, 100.0, doc="lambda_geo: one sigma of depth weighs like one epsilon of intensity"
+        0.02,
+        0.0,
+        100.0,
+        doc="lambda_geo of Eq. 14: weight of depth. At the default one standard deviation of depth weighs like one "
+        "epsilon of intensity.",
     )
+    expert: LossExpert = field(default_factory=LossExpert)
 
     @property
     def noise(self) -> SensorNoise:

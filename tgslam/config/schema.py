@@ -1,4 +1,7 @@
-"""Every setting of a run: one frozen dataclass a section, with defaults, units and allowed ranges in its module."""
+"""Every setting of a run: one frozen dataclass a section, with defaults, units and allowed ranges in its module.
+
+What only somebody who knows the algorithm can turn is in a section's second tier, `expert`, one dataclass a component.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ from tgslam.config.tracking_settings import KeyframeConfig, TrackingConfig
 class Config:
     """The whole of a run's settings."""
 
-    seed: int = setting(0, 0, 2**31 - 1)
+    seed: int = setting(0, 0, 2**31 - 1, doc="Seed of all that is random: two runs of one seed are equal.")
     dataset: DatasetConfig = dataclasses.field(default_factory=DatasetConfig)
     synthetic: SyntheticConfig = dataclasses.field(default_factory=SyntheticConfig)
     tracking: TrackingConfig = dataclasses.field(default_factory=TrackingConfig)

@@ -50,7 +50,7 @@ def pairs_from_lists(colour_list: Path, depth_list: Path, tolerance_s: float) ->
     if not len(colour_index):
         raise DatasetError(
             f"{depth_list}: no depth image is within {tolerance_s:g} s of a colour image; "
-            "check the timestamps, or raise dataset.association_tolerance_s"
+            "check the timestamps, or raise dataset.depth_tolerance_s"
         )
     if 2 * len(colour_index) < len(colour):
         _log.warning("%s: only %d of %d colour images have a depth image", colour_list, len(colour_index), len(colour))

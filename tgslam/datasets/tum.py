@@ -32,7 +32,7 @@ def open_tum(folder: Path, config: DatasetConfig) -> FolderSource:
     `groundtruth.txt` is optional. Raises DatasetError for missing or unusable lists, and ConfigError if the camera is
     not known.
     """
-    pairs = _image_pairs(folder, config.association_tolerance_s)
+    pairs = _image_pairs(folder, config.depth_tolerance_s)
     calibration = resolve(
         config,
         _freiburg_calibration(folder.resolve().name),

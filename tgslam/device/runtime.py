@@ -17,7 +17,10 @@ _ALIGNMENT = 64  # bytes, of 16 lanes loaded as one vector
 
 
 class Device(Enum):
-    """Where kernels run. `AUTO` is the CPU until the CUDA variants of the kernels have landed."""
+    """Where kernels run.
+
+    `AUTO` is the CPU as long as the kernels for CUDA have only been checked by execution on a CPU, not on a card.
+    """
 
     AUTO = "auto"
     CPU = "cpu"

@@ -25,7 +25,7 @@ FLOATER_KEY = "floater_share"
 
 MIN_AREA_M2 = 0.2  # true planes of which no frame shows more are void, smaller predicted ones no false positives
 FLOATER_M = 0.05  # from the nearest true surface
-_TAIL_PERCENT = 95.0
+_TAIL_PERCENT = 95.0  # the percentile that stands for the worst normals
 
 
 def summary_metrics(planes: Sequence[Plane]) -> Metrics:

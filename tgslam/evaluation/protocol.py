@@ -36,7 +36,7 @@ def trajectory_metrics(
     every_frame: Trajectory, keyframes: Trajectory, groundtruth: Trajectory, config: EvaluationConfig
 ) -> Metrics:
     """The values of `TRAJECTORY_KEYS`; null, with a logged reason, for what too few poses leave open."""
-    tolerance_s = config.association_tolerance_s
+    tolerance_s = config.truth_tolerance_s
 
     def absolute(trajectory: Trajectory) -> tuple[float]:
         return (100.0 * ate(trajectory, groundtruth, tolerance_s).rmse_m,)

@@ -154,7 +154,7 @@ def _scene_metrics(
     groundtruth = None if truth is None else source.groundtruth()  # in the truth's world, whatever else was compared
     if truth is None or groundtruth is None or stop_requested():
         return metrics
-    T_alignment = _alignment(run.every_frame, groundtruth, config.association_tolerance_s)
+    T_alignment = _alignment(run.every_frame, groundtruth, config.truth_tolerance_s)
     if T_alignment is not None:
         metrics[FLOATER_KEY] = floater_share(run.gaussians, truth, T_alignment)
     if read_ids is not None and run.planes:

@@ -47,7 +47,7 @@ def associate(estimate: Trajectory, groundtruth: Trajectory, tolerance_s: float)
         raise EvaluationError(
             f"none of {len(estimate)} poses is within {tolerance_s:g} s of the ground truth's {len(groundtruth)}"
             f"{_span('; the estimate', estimate)}{_span(', the ground truth', groundtruth)}"
-            "; check the file, or raise evaluation.association_tolerance_s"
+            "; check the file, or raise evaluation.truth_tolerance_s"
         )
     return _selected(estimate, i), _selected(groundtruth, j)
 

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.camera import Camera
+from tgslam.camera import Camera, SensorNoise
 from tgslam.config.graph_settings import ClosureConfig, LoopConfig
 from tgslam.geometry import inverse
+from tgslam.graph.findings import Closure
 from tgslam.graph.pose_graph import PoseGraph
 from tgslam.graph.structure.icp import View
-from tgslam.graph.structure.search import Closure, ClosureSearch
+from tgslam.graph.structure.search import ClosureSearch
 from tgslam.graph.visual.loop_search import LoopSearch
 from tgslam.map.keyframes import Keyframe
 from tgslam.map.world import Map
@@ -38,14 +39,13 @@ class GraphClosing:
     as a motion: of its estimate now against its own estimate when the map last followed, which it remembers for that.
     """
 
-    def __init__(self, camera: Camera, depth_sigma_per_m2: float, config: ClosureConfig, loops: LoopConfig) -> None:
-        """depth_sigma_per_m2: the sensor's noise, sigma_z = this * z^2."""
+    def __init__(self, camera: Camera, noise: SensorNoise, config: ClosureConfig, loops: LoopConfig) -> None:
         self._config = config
-        self._graph = PoseGraph(config)
+        self._graph = PoseGraph(config.expert.solving)
         self._landmarks = config.enabled and config.formulation != "closures"
         by_planes = config.enabled and config.formulation != "landmarks"
-        self._search = ClosureSearch(camera, depth_sigma_per_m2, config) if by_planes else None
-        self._loops = LoopSearch(camera, depth_sigma_per_m2, loops) if loops.enabled else None
+        self._search = ClosureSearch(camera, noise, config) if by_planes else None
+        self._loops = LoopSearch(camera, noise, loops) if loops.enabled else None
         self._followed: list[NDArray[np.float64]] = []  # T_cw by the graph's estimate when the map last followed it
         self._sighted: dict[int, set[int]] = {}  # PGI -> keyframes whose sightings are in the graph
         self._untied: list[tuple[int, int]] = []  # keyframes between which closures have moved nothing yet
@@ -90,17 +90,17 @@ class GraphClosing:
         if latest == 0:
             self._graph.add_first(0, T_cw)
             return
-        config, information = self._config, keyframe.information
+        sigmas, information = self._config.expert.evidence, keyframe.information
         odometry = {}
         for earlier, share in owners.items():
             motion = RelativePose(T_cw @ inverse(self._followed[earlier]), information)
-            motion = motion.widened(config.odometry_sigma_rad, config.odometry_sigma_m)
+            motion = motion.widened(sigmas.odometry_sigma_rad, sigmas.odometry_sigma_m)
             odometry[earlier] = RelativePose(motion.T_ji, share * motion.information)
         self._graph.add_keyframe(latest, odometry)
 
     def _add_sightings(self, planes: PlaneRegistry) -> None:
         """What is new; everything anew where PGIs have merged, split or ended."""
-        instances, surface_m = planes.instances, self._config.surface_sigma_m
+        instances, surface_m = planes.instances, self._config.expert.evidence.view_sigma_m
         gone = self._sighted.keys() - instances.keys()
         split = any(i.split_from is not None for k, i in instances.items() if k not in self._sighted)
         if gone or split:
@@ -120,7 +120,7 @@ class GraphClosing:
         latest, planes = len(world.keyframes) - 1, world.planes
         if self._search is None or planes is None or latest == 0 or latest % self._config.interval:
             return ()
-        surface_m, seen = self._config.surface_sigma_m, range(latest + 1)
+        surface_m, seen = self._config.expert.evidence.view_sigma_m, range(latest + 1)
         sightings: dict[int, Mapping[int, PlaneEstimate]] = {k: planes.seen_from(k, surface_m) for k in seen}
 
         def view(number: int) -> View:
@@ -144,7 +144,8 @@ class GraphClosing:
         motions = inverse(T_cw) @ np.stack(self._followed)
         shifts_m = np.linalg.norm(inverse(T_cw)[:, :3, 3] - inverse(np.stack(self._followed))[:, :3, 3], axis=1)
         turns_rad = np.linalg.norm(motions[:, :3, :3] - np.eye(3), axis=(1, 2)) / np.sqrt(2.0)
-        if shifts_m.max() < self._config.least_shift_m and turns_rad.max() < self._config.least_turn_rad:
+        least = self._config.expert.follow
+        if shifts_m.max() < least.least_shift_m and turns_rad.max() < least.least_turn_rad:
             return {}
         self._followed = [T.copy() for T in T_cw]
         return dict(enumerate(motions))

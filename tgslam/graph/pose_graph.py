@@ -1,33 +1,24 @@
-"""The pose graph over keyframes, with planes as landmarks if wanted. The only module that knows gtsam.
-
-gtsam's variables are camera-to-world poses, perturbed on the right, T_wc <- T_wc exp(eta). Since that is the same as
-T_cw <- exp(-eta) T_cw, and T_ji <- exp(xi) T_ji the same as T_ij <- T_ij exp(-xi), our information matrices, which
-speak of left perturbations of T_cw and T_ji in the order (rotation, translation), are gtsam's as they are.
-"""
+"""The pose graph over keyframes, with planes as landmarks if wanted."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.config.graph_settings import ClosureConfig
+from tgslam.config.graph_settings import SolvingSettings
 from tgslam.errors import GraphError
-from tgslam.geometry import adjoint, hat, inverse
+from tgslam.geometry import adjoint, inverse
+from tgslam.graph.factors import Edge, FactorMaker, Sighting, anchor_factor, plane_key, pose_key
+from tgslam.graph.solvers import Batch, make_solver
 from tgslam.planes.estimate import PlaneEstimate
 from tgslam.types import RelativePose
 
 Vector = NDArray[np.float64]
-
-_FIXED = 1e-6  # rad and m, of the first keyframe: it holds the graph
-_LOOSE = np.diag([10.0**-2] * 3 + [1000.0**-2] * 3)  # rad, m: odometry that says nothing leaves the graph regular
-_ROUNDS = 5  # updates at most of one call, until nothing has to be linearised anew
-_MAX_ITERATIONS = 50  # of the batch solver
-_TURNS = np.stack([hat(axis) for axis in np.eye(3)])  # [3, 3, 3] generators of rotations
 
 
 @dataclass(frozen=True)
@@ -40,43 +31,23 @@ class GraphEstimate:
     planes: Vector  # [P, 4] unit normal, and d in m of n . x + d = 0, world
 
 
-@dataclass(frozen=True)
-class _Edge:
-    """A measured motion between two keyframes."""
-
-    i: int
-    j: int
-    motion: RelativePose
-    closure: bool  # not odometry
-    robust: bool
-
-
-@dataclass(frozen=True)
-class _Sighting:
-    """A plane in the frame of the camera that saw it."""
-
-    keyframe: int
-    plane_id: int
-    plane: PlaneEstimate
-
-
 class PoseGraph:
     """Keyframes, the motions between them and the planes that they saw; `optimise` finds where they are.
 
     Nothing that is added takes effect before `optimise`. The first keyframe stays where it was added.
     """
 
-    def __init__(self, config: ClosureConfig) -> None:
-        self._config = config
+    def __init__(self, config: SolvingSettings) -> None:
+        self._config, self._factors = config, FactorMaker(config)
         self._keyframes: list[int] = []
-        self._edges: list[_Edge] = []
-        self._sightings: list[_Sighting] = []
+        self._edges: list[Edge] = []
+        self._sightings: list[Sighting] = []
         self._plane_ids: set[int] = set()  # of the sightings
         self._origin: tuple[int, Vector] | None = None
         self._values = gtsam.Values()  # the latest estimate, with a first guess of what is new
         self._fresh_factors = gtsam.NonlinearFactorGraph()
         self._fresh_values = gtsam.Values()
-        self._solver = self._new_solver()
+        self._solver = make_solver(config)
 
     @property
     def closure_count(self) -> int:
@@ -88,8 +59,8 @@ class PoseGraph:
         if self._origin is not None:
             raise GraphError(f"keyframe {keyframe} is not the first one: that is keyframe {self._origin[0]}")
         self._origin = (keyframe, T_cw)
-        self._fresh_factors.push_back(self._anchor())
-        self._insert(_pose(keyframe), gtsam.Pose3(inverse(T_cw)))
+        self._fresh_factors.push_back(anchor_factor(keyframe, T_cw))
+        self._insert(pose_key(keyframe), gtsam.Pose3(inverse(T_cw)))
         self._keyframes.append(keyframe)
 
     def add_keyframe(self, keyframe: int, odometry: Mapping[int, RelativePose]) -> None:
@@ -100,10 +71,10 @@ class PoseGraph:
         if not odometry:
             raise GraphError(f"keyframe {keyframe} has no odometry")
         starts = [self._pose_of(earlier) for earlier in odometry]
-        edges = [_Edge(earlier, keyframe, motion, closure=False, robust=False) for earlier, motion in odometry.items()]
+        edges = [Edge(earlier, keyframe, motion, closure=False, robust=False) for earlier, motion in odometry.items()]
         for edge in edges:
-            _check(edge)
-        self._insert(_pose(keyframe), starts[0].compose(gtsam.Pose3(inverse(edges[0].motion.T_ji))))
+            edge.check()
+        self._insert(pose_key(keyframe), starts[0].compose(gtsam.Pose3(inverse(edges[0].motion.T_ji))))
         self._keyframes.append(keyframe)
         for edge in edges:
             self._add(edge)
@@ -116,8 +87,8 @@ class PoseGraph:
         """
         for keyframe in (i, j):
             self._pose_of(keyframe)
-        edge = _Edge(i, j, motion, closure=True, robust=robust)
-        _check(edge)
+        edge = Edge(i, j, motion, closure=True, robust=robust)
+        edge.check()
         self._add(edge)
 
     def add_plane_observation(self, keyframe: int, plane_id: int, plane: PlaneEstimate) -> None:
@@ -125,9 +96,9 @@ class PoseGraph:
 
         Raises GraphError for an unknown keyframe, or for a plane without a sound covariance.
         """
-        pose, key = self._pose_of(keyframe), _landmark(plane_id)
-        sighting = _Sighting(keyframe, plane_id, plane)
-        self._fresh_factors.push_back(self._plane_factor(sighting))
+        pose, key = self._pose_of(keyframe), plane_key(plane_id)
+        sighting = Sighting(keyframe, plane_id, plane)
+        self._fresh_factors.push_back(self._factors.plane(sighting))
         self._sightings.append(sighting)
         self._plane_ids.add(plane_id)
         if not self._values.exists(key):
@@ -142,7 +113,7 @@ class PoseGraph:
         """
         kept = {plane_id for seen in sightings.values() for plane_id in seen}
         for plane_id in self._plane_ids - kept:
-            self._values.erase(_landmark(plane_id))
+            self._values.erase(plane_key(plane_id))
         self._sightings, self._plane_ids = [], set()
         for keyframe, seen in sightings.items():
             for plane_id, plane in seen.items():
@@ -170,7 +141,7 @@ class PoseGraph:
         T_wc = np.tile(np.eye(4), (len(flat), 1, 1))
         T_wc[:, :3, :3], T_wc[:, :3, 3] = flat[:, :9].reshape(-1, 3, 3), flat[:, 9:]
         plane_ids = sorted(self._plane_ids)
-        planes = [self._values.atOrientedPlane3(_landmark(plane)).planeCoefficients() for plane in plane_ids]
+        planes = [self._values.atOrientedPlane3(plane_key(plane)).planeCoefficients() for plane in plane_ids]
         return GraphEstimate(
             np.array(sorted(self._keyframes), np.int64),
             inverse(T_wc),
@@ -184,7 +155,7 @@ class PoseGraph:
         Raises GraphError when the graph does not have such keyframes, or not yet.
         """
         T_wi, T_wj = (self._pose_of(keyframe).matrix() for keyframe in (i, j))
-        keys = _pose(i), _pose(j)
+        keys = pose_key(i), pose_key(j)
         try:
             joint = self._solver.covariance(keys)
         except (RuntimeError, IndexError) as error:  # IndexError: not in the solver yet
@@ -195,27 +166,27 @@ class PoseGraph:
         return T_ji, jacobian @ covariance @ jacobian.T
 
     def _pose_of(self, keyframe: int) -> gtsam.Pose3:
-        if not self._values.exists(_pose(keyframe)):
+        if not self._values.exists(pose_key(keyframe)):
             raise GraphError(f"the pose graph does not have keyframe {keyframe}")
-        return self._values.atPose3(_pose(keyframe))
+        return self._values.atPose3(pose_key(keyframe))
 
     def _insert(self, key: int, value: Any) -> None:
         for values in (self._values, self._fresh_values):
             values.insert(key, value)
 
-    def _add(self, edge: _Edge) -> None:
+    def _add(self, edge: Edge) -> None:
         self._edges.append(edge)
-        self._fresh_factors.push_back(self._edge_factor(edge))
+        self._fresh_factors.push_back(self._factors.edge(edge))
 
     def _rebuild(self) -> None:
         """A new solver that is to start from the present values with all there is."""
-        self._solver = self._new_solver()
+        self._solver = make_solver(self._config)
         self._fresh_factors, self._fresh_values = self._all_factors(), gtsam.Values(self._values)
 
     def _restart(self) -> None:
         """Solve everything anew, damped, and hand the result to a new solver."""
         try:
-            self._values = _Batch().update(self._all_factors(), self._values)
+            self._values = Batch().update(self._all_factors(), self._values)
             self._rebuild()
             self._values = self._solver.update(self._fresh_factors, self._fresh_values)
         except RuntimeError as error:
@@ -225,172 +196,13 @@ class PoseGraph:
 
     def _all_factors(self) -> gtsam.NonlinearFactorGraph:
         graph = gtsam.NonlinearFactorGraph()
-        graph.push_back(self._anchor())
+        if self._origin is not None:
+            graph.push_back(anchor_factor(*self._origin))
         for edge in self._edges:
-            graph.push_back(self._edge_factor(edge))
+            graph.push_back(self._factors.edge(edge))
         for sighting in self._sightings:
-            graph.push_back(self._plane_factor(sighting))
+            graph.push_back(self._factors.plane(sighting))
         return graph
-
-    def _anchor(self) -> gtsam.PriorFactorPose3:
-        assert self._origin is not None
-        keyframe, T_cw = self._origin
-        noise = gtsam.noiseModel.Isotropic.Sigma(6, _FIXED)
-        return gtsam.PriorFactorPose3(_pose(keyframe), gtsam.Pose3(inverse(T_cw)), noise)
-
-    def _edge_factor(self, edge: _Edge) -> gtsam.BetweenFactorPose3:
-        motion = edge.motion
-        information = motion.information if edge.closure else motion.information + _LOOSE
-        noise = gtsam.noiseModel.Gaussian.SqrtInformation(_root(information), False)
-        return gtsam.BetweenFactorPose3(
-            _pose(edge.i),
-            _pose(edge.j),
-            gtsam.Pose3(inverse(motion.T_ji)),
-            self._robust(noise) if edge.robust else noise,
-        )
-
-    def _plane_factor(self, sighting: _Sighting) -> gtsam.CustomFactor:
-        keys = _pose(sighting.keyframe), _landmark(sighting.plane_id)
-        try:
-            error = _PlaneError(keys, sighting.plane)
-        except np.linalg.LinAlgError as bad:
-            name = f"plane {sighting.plane_id} as keyframe {sighting.keyframe} saw it"
-            raise GraphError(f"{name} has no sound covariance") from bad
-        return gtsam.CustomFactor(self._robust(gtsam.noiseModel.Unit.Create(3)), list(keys), error)
-
-    def _robust(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
-        scale = self._config.robust_sigmas
-        estimators: dict[str, Any] = {
-            "huber": gtsam.noiseModel.mEstimator.Huber,
-            "cauchy": gtsam.noiseModel.mEstimator.Cauchy,
-            "dcs": gtsam.noiseModel.mEstimator.DCS,
-        }
-        if self._config.robust == "none":
-            return noise
-        # DCS is given the square of where it begins
-        bound = scale**2 if self._config.robust == "dcs" else scale
-        return gtsam.noiseModel.Robust.Create(estimators[self._config.robust].Create(bound), noise)
-
-    def _new_solver(self) -> _Solver:
-        return _Incremental(self._config.relinearise) if self._config.solver == "incremental" else _Batch()
-
-
-class _PlaneError:
-    """The error of a plane landmark in a view, in standard deviations: turns about the view's tangents and the shift
-    at its centroid, as in its covariance.
-
-    gtsam's own OrientedPlane3Factor takes the tangents from the predicted plane, where they jump by 90 degrees as the
-    normal passes a tie of its two least components, such as the optical axis; with correlated errors that is wrong.
-    Nor does it take robust noise models.
-    """
-
-    def __init__(self, keys: tuple[int, int], plane: PlaneEstimate) -> None:
-        """keys: gtsam's, of the keyframe and of the plane. Raises LinAlgError without a sound covariance."""
-        self._keys = keys
-        first, second = plane.axes
-        white = np.linalg.inv(np.linalg.cholesky(plane.covariance))
-        if not np.isfinite(white).all():
-            raise np.linalg.LinAlgError
-        self._by_plane = np.empty((3, 4))  # of (n, d) in the camera's frame
-        np.matmul(white, np.array([-second, first, -plane.centroid]), out=self._by_plane[:, :3])
-        np.negative(white[:, 2], out=self._by_plane[:, 3])
-        by_pose = np.empty((3, 3, 6))  # what each component of n adds to the jacobian
-        by_pose[:, :, :3] = self._by_plane[:, :3] @ _TURNS
-        by_pose[:, :, 3:] = self._by_plane[:, 3, None] * np.eye(3)[:, None]
-        self._by_pose = by_pose.reshape(3, 18)
-
-    def __call__(
-        self, factor: gtsam.CustomFactor | None, values: gtsam.Values, jacobians: list[Vector] | None
-    ) -> Vector:
-        T_wc = values.atPose3(self._keys[0]).matrix()
-        plane_w = values.atOrientedPlane3(self._keys[1])
-        coefficients = plane_w.planeCoefficients()
-        by_normal_w, by_offset = self._by_plane @ T_wc[:3].T, self._by_plane[:, 3]
-        if jacobians is not None:
-            jacobians[0] = (coefficients[:3] @ T_wc[:3, :3] @ self._by_pose).reshape(3, 6)
-            of_plane = np.empty((3, 3))
-            of_plane[:, :2], of_plane[:, 2] = by_normal_w @ plane_w.normal().basis(), by_offset
-            jacobians[1] = of_plane
-        error: Vector = by_normal_w @ coefficients[:3] + by_offset * coefficients[3]
-        return error
-
-
-class _Solver(Protocol):
-    """How the graph is solved."""
-
-    def update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
-        """Take in new factors and first values of new variables; returns all values."""
-        ...
-
-    def covariance(self, keys: Sequence[int]) -> gtsam.JointMarginal:
-        """Joint covariance of variables."""
-        ...
-
-
-class _Incremental:
-    """iSAM2."""
-
-    def __init__(self, threshold: float) -> None:
-        params = gtsam.ISAM2Params()
-        params.relinearizeSkip = 1
-        params.setFactorization("QR")  # the squares of Cholesky's are too much for what is known a little in places
-        params.setRelinearizeThreshold(threshold)
-        self._isam = gtsam.ISAM2(params)
-
-    def update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
-        self._isam.update(factors, values)
-        for _ in range(_ROUNDS - 1):
-            if self._isam.update().getVariablesRelinearized() == 0:
-                break
-        return self._isam.calculateEstimate()
-
-    def covariance(self, keys: Sequence[int]) -> gtsam.JointMarginal:
-        return self._isam.jointMarginalCovariance(list(keys))
-
-
-class _Batch:
-    """Levenberg-Marquardt over everything, each time."""
-
-    def __init__(self) -> None:
-        self._graph = gtsam.NonlinearFactorGraph()
-        self._values = gtsam.Values()
-
-    def update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
-        self._graph.push_back(factors)
-        self._values.insert(values)
-        params = gtsam.LevenbergMarquardtParams()
-        params.setMaxIterations(_MAX_ITERATIONS)
-        params.setLinearSolverType("MULTIFRONTAL_QR")
-        self._values = gtsam.LevenbergMarquardtOptimizer(self._graph, self._values, params).optimize()
-        return gtsam.Values(self._values)
-
-    def covariance(self, keys: Sequence[int]) -> gtsam.JointMarginal:
-        return gtsam.Marginals(self._graph, self._values).jointMarginalCovariance(list(keys))
-
-
-def _pose(keyframe: int) -> int:
-    key: int = gtsam.symbol("x", keyframe)
-    return key
-
-
-def _landmark(plane_id: int) -> int:
-    key: int = gtsam.symbol("p", plane_id)
-    return key
-
-
-def _root(information: NDArray[np.floating[Any]]) -> Vector:
-    """R with R^T R = information, a symmetric matrix without negative eigenvalues but maybe with zeros."""
-    eigenvalues, vectors = np.linalg.eigh(information)
-    return np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * vectors.T
-
-
-def _check(edge: _Edge) -> None:
-    name, motion = f"the motion from keyframe {edge.i} to {edge.j}", edge.motion
-    if not (np.isfinite(motion.T_ji).all() and np.isfinite(motion.information).all()):
-        raise GraphError(f"{name} is not finite")
-    eigenvalues = np.linalg.eigvalsh(motion.information)
-    if eigenvalues[0] < -1e-6 * max(eigenvalues[-1], 1.0):
-        raise GraphError(f"{name} has an information matrix with a negative eigenvalue")
 
 
 def _first_line(error: Exception) -> str:

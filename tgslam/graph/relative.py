@@ -15,16 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from tgslam.config.graph_settings import ClosureConfig, LoopConfig
+from tgslam.config.graph_settings import AcceptanceSettings
 from tgslam.geometry import so3_exp
 from tgslam.planes.estimate import PlaneEstimate, difference
 from tgslam.types import RelativePose
 
 Vector = NDArray[np.float64]
 Lineariser = Callable[[Vector], "Quadratic"]
-Limits = ClosureConfig | LoopConfig  # of which `known_rad` and `known_m` count here
 
-_ITERATIONS = 10
+_ITERATIONS = 10  # at most; exact planes settle in three or four
 _SETTLED = 1e-5  # rad and m: a smaller step is none
 
 
@@ -91,14 +90,16 @@ def of_planes(pairs: PlanePairs, T_ji: Vector) -> Quadratic:
     return Quadratic(A, b, float(np.sum(error * weighted[:, :, 6])), error.size)
 
 
-def measure(pairs: PlanePairs, prior_T_ji: Vector, config: ClosureConfig) -> Measurement:
+def measure(pairs: PlanePairs, prior_T_ji: Vector, limits: AcceptanceSettings) -> Measurement:
     """The motion from planes alone, free directions as in the prior [4, 4]. Gauss-Newton from there."""
-    return solve(lambda T_ji: of_planes(pairs, T_ji), prior_T_ji, config)
+    return solve(lambda T_ji: of_planes(pairs, T_ji), prior_T_ji, limits)
 
 
-def solve(linearise: Lineariser, prior_T_ji: Vector, config: Limits, iterations: int = _ITERATIONS) -> Measurement:
+def solve(
+    linearise: Lineariser, prior_T_ji: Vector, limits: AcceptanceSettings, iterations: int = _ITERATIONS
+) -> Measurement:
     """Gauss-Newton over the measured directions: steps have no part in the others."""
-    unit, T_ji = _unit(config), prior_T_ji
+    unit, T_ji = _unit(limits), prior_T_ji
     for _ in range(iterations):
         quadratic = linearise(T_ji)
         vectors, information = _measured(quadratic.A, unit)
@@ -112,9 +113,9 @@ def solve(linearise: Lineariser, prior_T_ji: Vector, config: Limits, iterations:
     return Measurement(T_ji, vectors.T / unit, 1.0 / information, quadratic.value, freedom)
 
 
-def information_gain(quadratic: Quadratic, config: ClosureConfig) -> float:
-    """How much it says of the motion to one who knows this to the config's limits: in nats."""
-    unit = _unit(config)
+def information_gain(quadratic: Quadratic, limits: AcceptanceSettings) -> float:
+    """How much it says of the motion to one who knows this to the limits: in nats."""
+    unit = _unit(limits)
     return 0.5 * float(np.linalg.slogdet(np.eye(6) + quadratic.A * unit[:, None] * unit)[1])
 
 
@@ -127,7 +128,7 @@ def _moved(T_ji: Vector, step: Vector) -> Vector:
 
 
 def _measured(A: Vector, unit: Vector) -> tuple[Vector, Vector]:
-    """Orthonormal directions [6, R], in units of the config's limits, in which the information A [6, 6] is more than
+    """Orthonormal directions [6, R], in units of the limits, in which the information A [6, 6] is more than
     those ask; and how much that is [R].
     """
     eigenvalues, vectors = np.linalg.eigh(A * unit[:, None] * unit)
@@ -135,6 +136,6 @@ def _measured(A: Vector, unit: Vector) -> tuple[Vector, Vector]:
     return vectors[:, known], eigenvalues[known]
 
 
-def _unit(config: Limits) -> Vector:
+def _unit(limits: AcceptanceSettings) -> Vector:
     """[6] the limits `known_rad` and `known_m`."""
-    return np.array([config.known_rad] * 3 + [config.known_m] * 3)
+    return np.array([limits.known_rad] * 3 + [limits.known_m] * 3)

@@ -36,7 +36,7 @@ class KeyframeSelector:
         """
         union = int((seen | self._seen).sum())
         overlap = int((seen & self._seen).sum()) / max(union, 1)
-        if overlap < self.config.min_overlap:
+        if overlap < self.config.min_covisibility:
             return f"co-visibility: overlap {overlap:.2f}"
         if unexplained > self.config.max_unexplained:
             return f"co-visibility: {unexplained:.0%} of the frame is not in the map"

@@ -1,4 +1,4 @@
-"""What a depth image lacks, guessed: holes at the edges of things, and surfaces that return no light."""
+"""What a sensor's depth image lacks: holes are guessed."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-_STEEPEST = 5.7  # tangent of 80 degrees
+from tgslam.ops.depth import STEEPEST
+
 _SAME_PLANE = 0.1  # of inverse depth by which a guess differs in the median from a plane that it goes on
-_AFFINE_WINDOW_PX = 15
+_AFFINE_WINDOW_PX = 15  # over which a plane is fitted to what a hole begins at
 _NARROW_PX = 2  # a hole's pixels that are no farther from a measurement are at an edge
 
 
@@ -121,7 +122,7 @@ def _steep(inverse_depth: NDArray[np.float32], focal_px: float) -> NDArray[np.bo
     """[H, W] where an image of inverse depth, 1/m, is steeper than a surface that a sensor measures."""
     down = cv2.Sobel(inverse_depth, -1, 0, 1, scale=0.125)
     across = cv2.Sobel(inverse_depth, -1, 1, 0, scale=0.125)
-    steep: NDArray[np.bool_] = np.hypot(down, across) > _STEEPEST / focal_px * inverse_depth
+    steep: NDArray[np.bool_] = np.hypot(down, across) > STEEPEST / focal_px * inverse_depth
     return steep
 
 

@@ -15,7 +15,7 @@ from tgslam.device import runtime
 from tgslam.geometry import inverse, orthonormalized
 from tgslam.map.holes import Guess, filled
 from tgslam.map.plane_labels import PlaneLabels
-from tgslam.ops import image as images
+from tgslam.ops.normals import normals_of
 from tgslam.types import Exposure, Frame, Matrix4, Trajectory
 
 _DEPTH_UNIT_M = 0.0002  # TUM's and finer than any RGB-D sensor's: 16 bits reach 13.1 m
@@ -113,8 +113,7 @@ class KeyframeImages:
         return self._normals(self.guess.depth_m)
 
     def _normals(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        normals = images.normals(runtime.to_device(depth_m), self._camera, sigma_per_m2=self._noise.per_m2)
-        return runtime.to_host(normals)
+        return runtime.to_host(normals_of(runtime.to_device(depth_m), self._camera, self._noise))
 
 
 class Keyframes(Sequence[Keyframe]):

@@ -121,7 +121,7 @@ class Refiner:
             visible,
             pace,
         )
-        weight = self.loss.weight_pho * self.loss.weight_l1 / (3.0 * self.loss.charbonnier_colour)
+        weight = self.loss.weight_pho * self.loss.weight_l1 / (3.0 * self.loss.expert.penalties.charbonnier_colour)
         if self.config.optimizer == "relaxation":
             relaxation.relax(
                 gaussians.count, visible, gradient.colour, gradient.curvature, loss.totals,

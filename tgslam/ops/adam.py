@@ -11,7 +11,7 @@ from tgslam.device import runtime
 from tgslam.device.arrays import require
 from tgslam.kernels import adam as kernels
 
-_MAX_CORRECTIONS = 1 << 15
+_MAX_CORRECTIONS = 1 << 15  # that are tabulated; for the usual betas they are 1 after 18,000 updates
 
 
 class Adam:

@@ -100,8 +100,7 @@ class NormalSums:
 
         live: as `pack_live` writes it. surface: [H, W, SURFACE], texture: [H, W, TEXTURE] of the model, on the device.
         """
-        size = (self._camera.height, self._camera.width)
-        require("surface", surface, (*size, SURFACE))
-        require("texture", texture, (*size, TEXTURE))
+        require("surface", surface, (*self._camera.shape, SURFACE))
+        require("texture", texture, (*self._camera.shape, TEXTURE))
         runtime.upload(settings, self._settings)
         return self._add(self._settings, live, surface, texture)

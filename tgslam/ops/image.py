@@ -1,24 +1,15 @@
-"""Image operations on device arrays: luminance, pyramids, gradients, the texture gate, normals from depth."""
+"""Image operations on device arrays: luminance, pyramids, gradients and the texture gate."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.camera import Camera
 from tgslam.device import runtime
 from tgslam.device.arrays import require
 from tgslam.kernels import alignment
 from tgslam.kernels import image as kernels
-from tgslam.kernels import normals as fitting
-from tgslam.kernels.cuda import normals as cuda_fitting
 
-STEEPEST_RAD = 1.3  # between a surface's normal and the optical axis
-_ADOPTED_COSINE = 0.98  # of a plane's splats, whose tilts are a few degrees
-_ADOPTED_MEASURED_COSINE = 0.8  # of measured normals, which noise turns by 0.1 to 0.2 rad: those turned most feign most
-_ADOPTED_M, _ADOPTED_SIGMAS = 0.01, 1.5
 DEPTH_EDGE = 0.05  # measurements farther apart than this part of their depth lie on different surfaces
 UNGATED = (-1.0, 1.0)  # in place of what `gate_range` returns: T = 0 for a gradient of any length
 _SAMPLE_ROWS = 120  # percentiles come from a grid of about this many rows
@@ -144,74 +135,6 @@ def sampled(image: np.ndarray) -> NDArray[np.float32]:
     sample = runtime.empty((-(-image.shape[0] // step), -(-image.shape[1] // step)))
     kernels.sample_grid(image, step, sample)
     return runtime.to_host(sample)
-
-
-def normals(
-    depth_m: np.ndarray,
-    camera: Camera,
-    radius: int = 3,
-    sigma_per_m2: float = 0.0015,
-    steepest_rad: float = STEEPEST_RAD,
-    out: np.ndarray | None = None,
-) -> np.ndarray:
-    """Unit surface normals from float32 [H, W] depth in m -> [H, W, 3], camera frame, towards the camera.
-
-    Inverse depth of a plane is affine in the pixel, and the noise of a structured-light sensor, sigma_z =
-    sigma_per_m2 z^2, is constant in inverse depth: a least-squares fit of inverse depth is the best one. There is a
-    fit for each 2x2 block (an odd last row or column joins the block before), over (2 radius + 1)^2 blocks (radius 3:
-    14x14 pixels), from those on the same surface: within 4 sigma plus what a plane at `steepest_rad` to the optical
-    axis would rise to. (0, 0, 0) where there is no depth, where fewer than 30 % of the window are left, where the
-    fit's residual exceeds 2 sigma and 0.3 % (their root sum of squares: an edge runs through it), and at pixels more
-    than 4 sigma plus 1 % off the fit (the far side of an edge).
-    """
-    require("depth_m", depth_m, (camera.height, camera.width))
-    height, width = depth_m.shape
-    out = _output(out, (height, width, 3))
-    PlaneFits(camera, radius, sigma_per_m2, steepest_rad).write(depth_m, out)
-    return out
-
-
-class PlaneFits:
-    """`normals` for images of one size, with the scratch memory for it."""
-
-    def __init__(self, camera: Camera, radius: int, sigma_per_m2: float, steepest_rad: float = STEEPEST_RAD) -> None:
-        if not 1 <= radius <= fitting.MARGIN:
-            raise ValueError(f"radius must be from 1 to {fitting.MARGIN} blocks, but is {radius}")
-        height, width = halved((camera.height, camera.width))
-        vectors = -(-width // fitting.LANES)
-        self.camera, self._radius = camera, radius
-        self._settings = runtime.to_device(
-            [camera.fx, camera.fy, camera.cx, camera.cy, sigma_per_m2, math.tan(steepest_rad)]
-        )
-        self._blocks = runtime.zeros((height + 2 * fitting.MARGIN, vectors + 2, fitting.LANES))
-        self._fits = runtime.empty((height, vectors, fitting.FIT, fitting.LANES))
-
-    def write(self, depth_m: np.ndarray, out: np.ndarray) -> None:
-        """Normals of float32 [H, W] into out [H, W, 3], or [H, W, 4] with the depth beside them."""
-        with_depth = out.shape[2] == alignment.SURFACE
-        require("depth_m", depth_m, (self.camera.height, self.camera.width))
-        require("out", out, (*depth_m.shape, alignment.SURFACE if with_depth else 3))
-        fitting.inverse_depth_blocks(depth_m, DEPTH_EDGE, self._blocks)
-        if runtime.device() is runtime.Device.CUDA:
-            least = fitting.least_count(self._radius)
-            cuda_fitting.fit_planes(self._settings, self._blocks, self._radius, least, self._fits)
-        else:
-            fitting.fit_planes(self._settings, self._blocks, self._radius, self._fits)
-        fitting.spread_normals(self._settings, depth_m, self._fits, with_depth, out)
-
-    def adopt(self, planes_c: NDArray[np.float64], surface: np.ndarray, *, measured: bool = False) -> None:
-        """Replace normals of surface [H, W, 4] (normal, depth in m) by those of the planes that it lies on.
-
-        planes_c: [P, 4] unit normal and offset in m of n . x + d = 0, camera frame, the normal towards the camera. A
-        pixel lies on a plane that it is off by no more than 1 cm and 1.5 sigma of the sensor's depth, and 11 degrees.
-        measured: the surface is of a single depth image, not of a rendering; 37 degrees.
-        """
-        require("surface", surface, (self.camera.height, self.camera.width, alignment.SURFACE))
-        if len(planes_c):
-            least_cosine = _ADOPTED_MEASURED_COSINE if measured else _ADOPTED_COSINE
-            fitting.adopt_normals(
-                self._settings, runtime.to_device(planes_c), least_cosine, _ADOPTED_M, _ADOPTED_SIGMAS, surface
-            )
 
 
 def _percentile(ordered: NDArray[np.float32], percentile: float) -> float:

@@ -152,7 +152,8 @@ def observe(
         mask.fill(1.0)
     require("mask", mask, (height, width))
     if config.gate:
-        gate = images.texture_gate(images.luminance(colour), config.gate_percentile, config.gate_noise_floor)
+        texture = config.expert.texture
+        gate = images.texture_gate(images.luminance(colour), texture.gate_percentile, texture.gate_noise_floor)
     else:
         gate = runtime.zeros((height, width))
     prepare = cuda.observe if runtime.device() is runtime.Device.CUDA else cpu.observe
@@ -174,13 +175,13 @@ def rgbd_loss(
 
     colour: float32 [H, W, 3]; gain * colour + bias is compared. depth: float32 [H, W] accumulated sum of weight times
     depth, m. opacity: float32 [H, W]; depth / opacity is compared where there is a measurement and opacity exceeds
-    config.min_depth_opacity. min_opacity: pixels of less opacity take no part in E_pho (tracking against a map with
+    `min_depth_opacity`. min_opacity: pixels of less opacity take no part in E_pho (tracking against a map with
     holes); masks are constants to the gradient. Each part is a mean over its pixels:
 
     - l1: Charbonnier over the three channels, M_rgb;
     - grad: Charbonnier on the length of the Sobel gradient difference of luminance, times 1 - T, M_rgb;
     - ssim: 1 - SSIM of luminance, 11x11 Gaussian window (sigma 1.5), times 1 - T, M_rgb;
-    - geo: Charbonnier on (depth - measured) / (sigma_per_m2 measured^2), times 1 + gate_depth_boost T, M_d.
+    - geo: Charbonnier on (depth - measured) over the sensor's noise, times 1 + gate_depth_boost T, M_d.
 
     grad and ssim leave out the border of 5 px; where M_rgb < 1 they see the observation mixed in by 1 - M_rgb.
     """

@@ -49,11 +49,14 @@ class CpuObjective:
         self._slope = runtime.zeros((height, blocks + 2, SLOPES, LANES))
         self._field = runtime.zeros((height, blocks, SLOPES, LANES))
         self._partial = runtime.zeros((height, TOTALS))
-        self._totals = runtime.empty((TOTALS,))
-        self._g_colour = runtime.empty((height, 3 * blocks, LANES))
-        self._g_depth, self._g_opacity, self._w_colour, self._w_depth = (
-            runtime.empty((height, blocks, LANES)) for _ in range(4)
-        )
+        self._result = LossImages(
+            colour=runtime.empty((height, 3 * blocks, LANES)),
+            depth=runtime.empty((height, blocks, LANES)),
+            opacity=runtime.empty((height, blocks, LANES)),
+            w_colour=runtime.empty((height, blocks, LANES)),
+            w_depth=runtime.empty((height, blocks, LANES)),
+            totals=runtime.empty((TOTALS,)),
+        )  # as rows of lanes
 
     def evaluate(
         self,
@@ -68,32 +71,33 @@ class CpuObjective:
     ) -> LossImages:
         """See `losses.rgbd_loss`."""
         colour, depth, opacity = in_lanes(colour), in_lanes(depth), in_lanes(opacity)
+        result, texture, penalties = self._result, config.expert.texture, config.expert.penalties
         kernels.mix(
             self.width, colour, opacity, observation.depth, observation.mask, observation.luma, observation.texture,
-            gain, bias, min_opacity, config.min_depth_opacity, self._x, self._weight, self._partial,
+            gain, bias, min_opacity, penalties.min_depth_opacity, self._x, self._weight, self._partial,
         )  # fmt: skip
         kernels.structure(
-            self._x, observation.luma, observation.statistics, self._weight, config.charbonnier_grad,
+            self._x, observation.luma, observation.statistics, self._weight, penalties.charbonnier_grad,
             self._column, self._slope, self._field, self._partial,
         )  # fmt: skip
-        kernels.add_partials(self._partial, 0, STRUCTURE, self._totals)
+        kernels.add_partials(self._partial, 0, STRUCTURE, result.totals)
         kernels.gradient(
             colour, depth, opacity, observation.colour, observation.depth, observation.mask, observation.gate,
-            self._x, observation.luma, self._field, self._totals,
-            gain, bias, min_opacity, config.min_depth_opacity,
-            config.charbonnier_colour, config.charbonnier_depth_sigmas, config.gate_depth_boost,
-            config.depth_sigma_per_m2, config.weight_pho * config.weight_l1, config.weight_pho * config.weight_grad,
+            self._x, observation.luma, self._field, result.totals,
+            gain, bias, min_opacity, penalties.min_depth_opacity,
+            penalties.charbonnier_colour, penalties.charbonnier_depth_sigmas, texture.gate_depth_boost,
+            config.noise.per_m2, config.weight_pho * config.weight_l1, config.weight_pho * config.weight_grad,
             config.weight_pho * config.weight_ssim, config.weight_geo,
-            self._g_colour, self._g_depth, self._g_opacity, self._w_colour, self._w_depth, self._partial,
+            result.colour, result.depth, result.opacity, result.w_colour, result.w_depth, self._partial,
         )  # fmt: skip
-        kernels.add_partials(self._partial, STRUCTURE, TOTALS, self._totals)
+        kernels.add_partials(self._partial, STRUCTURE, TOTALS, result.totals)
         return LossImages(
-            self._image(self._g_colour, 3),
-            self._image(self._g_depth),
-            self._image(self._g_opacity),
-            self._image(self._w_colour),
-            self._image(self._w_depth),
-            self._totals,
+            self._image(result.colour, 3),
+            self._image(result.depth),
+            self._image(result.opacity),
+            self._image(result.w_colour),
+            self._image(result.w_depth),
+            result.totals,
         )
 
     def _image(self, lanes: np.ndarray, channels: int = 1) -> np.ndarray:

@@ -65,22 +65,23 @@ class CudaObjective:
     ) -> LossImages:
         """See `losses.rgbd_loss`."""
         threads, luma, result = self._threads, observation.luma, self._result
+        texture, penalties = config.expert.texture, config.expert.penalties
         kernels.mix(
             threads, colour, opacity, observation.depth, observation.mask, luma, observation.texture,
-            gain, bias, min_opacity, config.min_depth_opacity, self._x, self._weight, self._partial,
+            gain, bias, min_opacity, penalties.min_depth_opacity, self._x, self._weight, self._partial,
         )  # fmt: skip
         kernels.blur_columns(threads, self._x, luma, self._column)
         kernels.structure(
-            threads, self._x, luma, self._column, observation.statistics, self._weight, config.charbonnier_grad,
+            threads, self._x, luma, self._column, observation.statistics, self._weight, penalties.charbonnier_grad,
             self._slope, self._partial,
         )  # fmt: skip
         kernels.adjoint_rows(threads, self._slope, self._field)
         kernels.add_partials(threads // WARP, self._partial, 0, STRUCTURE, result.totals)
         kernels.gradient(
             threads, colour, depth, opacity, observation.colour, observation.depth, observation.mask, observation.gate,
-            self._x, luma, self._field, result.totals, gain, bias, min_opacity, config.min_depth_opacity,
-            config.charbonnier_colour, config.charbonnier_depth_sigmas, config.gate_depth_boost,
-            config.depth_sigma_per_m2, config.weight_pho * config.weight_l1, config.weight_pho * config.weight_grad,
+            self._x, luma, self._field, result.totals, gain, bias, min_opacity, penalties.min_depth_opacity,
+            penalties.charbonnier_colour, penalties.charbonnier_depth_sigmas, texture.gate_depth_boost,
+            config.noise.per_m2, config.weight_pho * config.weight_l1, config.weight_pho * config.weight_grad,
             config.weight_pho * config.weight_ssim, config.weight_geo,
             result.colour, result.depth, result.opacity, result.w_colour, result.w_depth, self._partial,
         )  # fmt: skip

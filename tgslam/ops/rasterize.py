@@ -53,9 +53,11 @@ class Rasterizer:
     def __init__(self, camera: Camera, stopwatch: Stopwatch | None = None) -> None:
         """stopwatch: takes the seconds of every stage, for benchmarks."""
         self.camera = camera
-        H, W = camera.height, camera.width
         self._images = RenderImages(
-            runtime.zeros((H, W, 3)), runtime.zeros((H, W)), runtime.zeros((H, W)), runtime.zeros((H, W, 3))
+            colour=runtime.zeros((*camera.shape, 3)),
+            depth=runtime.zeros(camera.shape),
+            opacity=runtime.zeros(camera.shape),
+            embedding=runtime.zeros((*camera.shape, 3)),
         )
         self._pose = runtime.zeros((12,))
         self._with_embedding = False

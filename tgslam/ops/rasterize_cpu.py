@@ -10,8 +10,9 @@ from tgslam.device import runtime
 from tgslam.device.stopwatch import Stopwatch, stage
 from tgslam.kernels import projection, projection_gradient, rasterize
 from tgslam.kernels.simd import CHUNK, CHUNKS, LANES, PER_ROW, TILE
-from tgslam.ops.render_images import ImageGradient, RenderImages
+from tgslam.ops.render_images import AbsentGradient, ImageGradient, RenderImages
 from tgslam.ops.splats import MapGradient, Splats
+from tgslam.ops.tiles import Tiling
 
 _MOMENT_ROWS = 2  # vectors that hold a splat's moments
 
@@ -43,23 +44,26 @@ class _SplatBuffers:
         self.by_depth = runtime.empty((capacity, 4), np.int32)
 
 
+class _TileBuffers:
+    """Scratch for one entry per tile."""
+
+    def __init__(self, tiles: Tiling) -> None:
+        self.start = runtime.zeros((tiles.count + 1,), np.int32)  # first slot of each, and the end of the last
+        self.splats = runtime.zeros((rasterize.SEGMENTS, tiles.count + tiles.across + 1), np.int32)  # counted
+
+
 class CpuSplatting:
     """Stages of `forward`: project, list, blend; of `backward`: blend_backward, gather, unproject."""
 
     def __init__(self, camera: Camera, stopwatch: Stopwatch | None = None) -> None:
-        self.camera, self.stopwatch = camera, stopwatch
-        self.tiles_x = -(-camera.width // TILE)
-        self.tiles = self.tiles_x * -(-camera.height // TILE)
-        H, W = camera.height, camera.width
-        self._camera = runtime.to_device([camera.fx, camera.fy, camera.cx, camera.cy])
+        self.camera, self.stopwatch, self._tiling = camera, stopwatch, Tiling.of(camera)
+        self._intrinsics = runtime.to_device(camera.intrinsics)
         self._pixels = _pixels_of_chunks()
-        self._g = runtime.zeros((self.tiles * CHUNKS, rasterize.G, LANES), lanes=True)
-        self._no_weight = runtime.zeros((H, W))
-        self._no_embedding = runtime.zeros((H, W, 3))
-        self._slots = _SlotBuffers(1 << 15, self.tiles)
+        self._g = runtime.zeros((self._tiling.count * CHUNKS, rasterize.G, LANES), lanes=True)
+        self._absent = AbsentGradient.of_size(camera.height, camera.width)
+        self._slots = _SlotBuffers(1 << 15, self._tiling.count)
         self._splats = _SplatBuffers(1)
-        self._start = runtime.zeros((self.tiles + 1,), np.int32)
-        self._per_tile = runtime.zeros((rasterize.SEGMENTS, self.tiles + self.tiles_x + 1), np.int32)
+        self._tiles = _TileBuffers(self._tiling)
         self.slot_count = 0
 
     @property
@@ -81,7 +85,7 @@ class CpuSplatting:
             slots = self._list_slots(gaussians.count)
         with stage(self.stopwatch, "blend"):
             rasterize.forward(
-                self.tiles, self.tiles_x, self._start, slots.ids, self._splats.splat,
+                self._tiling.count, self._tiling.across, self._tiles.start, slots.ids, self._splats.splat,
                 slots.slot, slots.slot, slots.mask, slots.groups, slots.groups, self._pixels, with_embedding,
                 images.colour, images.depth, images.opacity, images.embedding,
             )  # fmt: skip
@@ -92,13 +96,14 @@ class CpuSplatting:
         """Add the gradients of the last `forward` to `into`; returns the pose's [6]."""
         curvature = g.colour_weight is not None and g.depth_weight is not None
         embedding = g.embedding is not None
-        slots, splats, n = self._slots, self._splats, gaussians.count
+        slots, splats, absent, n = self._slots, self._splats, self._absent, gaussians.count
         with stage(self.stopwatch, "blend_backward"):
             rasterize.backward(
-                self.tiles, self.tiles_x, self._start, slots.slot, slots.mask, slots.entry, embedding, curvature,
+                self._tiling.count, self._tiling.across, self._tiles.start, slots.slot, slots.mask, slots.entry,
+                embedding, curvature,
                 images.colour, images.depth, images.opacity, images.embedding,
-                g.colour, g.depth, g.opacity, g.embedding if embedding else self._no_embedding,
-                g.colour_weight if curvature else self._no_weight, g.depth_weight if curvature else self._no_weight,
+                g.colour, g.depth, g.opacity, g.embedding if embedding else absent.embedding,
+                g.colour_weight if curvature else absent.weight, g.depth_weight if curvature else absent.weight,
                 self._pixels, self._g, slots.grad, slots.embedding_grad,
             )  # fmt: skip
         with stage(self.stopwatch, "gather"):
@@ -109,7 +114,7 @@ class CpuSplatting:
             blocks = runtime.zeros((max(1, -(-n // projection_gradient.POSE_BLOCK)), 6))
             projection_gradient.project_backward(
                 n, gaussians.mean, gaussians.log_scale, gaussians.quat_wxyz, gaussians.opacity_logit,
-                splats.splat, pose, self._camera, self.camera.width, self.camera.height, embedding,
+                splats.splat, pose, self._intrinsics, self.camera.width, self.camera.height, embedding,
                 splats.tile_count, splats.moments.reshape(splats.capacity, -1),
                 into.mean, into.log_scale, into.quat_wxyz, into.opacity_logit, into.colour, into.embedding,
                 into.curvature, blocks,
@@ -123,30 +128,30 @@ class CpuSplatting:
         splats = self._splats
         projection.project(
             gaussians.count, gaussians.mean, gaussians.log_scale, gaussians.quat_wxyz, gaussians.opacity_logit,
-            gaussians.colour, gaussians.embedding, pose, self._camera, self.camera.width, self.camera.height,
+            gaussians.colour, gaussians.embedding, pose, self._intrinsics, self.camera.width, self.camera.height,
             with_embedding, splats.splat, splats.tile_rect, splats.tile_count,
         )  # fmt: skip
 
     def _list_slots(self, count: int) -> _SlotBuffers:
         """List each tile's splats in depth order (equal depths by index)."""
-        splats = self._splats
+        splats, tiles = self._splats, self._tiles
         tile_count = runtime.to_host(splats.tile_count)[:count]
         ends = np.cumsum(tile_count, dtype=np.int32)
         self.slot_count = int(ends[-1]) if count else 0
         if self.slot_count > self._slots.capacity:
-            self._slots = _SlotBuffers(max(2 * self._slots.capacity, self.slot_count), self.tiles)
+            self._slots = _SlotBuffers(max(2 * self._slots.capacity, self.slot_count), self._tiling.count)
         np.subtract(ends, tile_count, out=splats.first_of[:count])
         visible = np.flatnonzero(tile_count)
         order = _depth_order(runtime.to_host(splats.splat)[visible, projection.Z], visible)
         rasterize.count_slots(
-            len(order), order, splats.tile_rect, splats.first_of, self.tiles_x, splats.by_depth, self._per_tile
+            len(order), order, splats.tile_rect, splats.first_of, self._tiling.across, splats.by_depth, tiles.splats
         )
-        per_tile = self._per_tile[:, : self.tiles]
+        per_tile = tiles.splats[:, : self._tiling.count]
         cursor = np.cumsum(per_tile, 0, dtype=np.int32)
-        np.cumsum(cursor[-1], out=self._start[1:])
-        cursor += self._start[:-1] - per_tile
+        np.cumsum(cursor[-1], out=tiles.start[1:])
+        cursor += tiles.start[:-1] - per_tile
         rasterize.fill_slots(
-            len(order), order, splats.by_depth, self.tiles_x, cursor, self._slots.ids, self._slots.entry
+            len(order), order, splats.by_depth, self._tiling.across, cursor, self._slots.ids, self._slots.entry
         )
         return self._slots
 

@@ -11,11 +11,11 @@ from tgslam.device.stopwatch import Stopwatch, stage
 from tgslam.kernels import projection, projection_gradient
 from tgslam.kernels.cuda import rasterize, scan
 from tgslam.kernels.cuda.block import WARPS
-from tgslam.kernels.simd import TILE
 from tgslam.kernels.warp import WARP
-from tgslam.ops.render_images import ImageGradient, RenderImages
+from tgslam.ops.render_images import AbsentGradient, ImageGradient, RenderImages
 from tgslam.ops.sort import Pairs, PrefixSums, RadixSort
 from tgslam.ops.splats import MapGradient, Splats
+from tgslam.ops.tiles import Tiling
 
 
 class _SplatBuffers:
@@ -32,6 +32,22 @@ class _SplatBuffers:
         self.pose_rows = runtime.empty((max(1, -(-capacity // projection_gradient.POSE_BLOCK)), 6))
 
 
+class _SlotBuffers(Pairs):
+    """Scratch for one entry per (splat, tile), grown by doubling: pairs of tile and Gaussian."""
+
+    def __init__(self, capacity: int) -> None:
+        super().__init__(capacity)
+        self.reached = runtime.empty((capacity,), np.int32)
+
+
+class _TileBuffers:
+    """Scratch for one entry per tile."""
+
+    def __init__(self, tiles: int) -> None:
+        self.start = runtime.zeros((tiles + 1,), np.int32)  # first slot of each, and the end of the last
+        self.stop = runtime.zeros((tiles, WARPS), np.int32)  # where each warp has ended
+
+
 class CudaSplatting:
     """Stages of `forward`: project, list, blend; of `backward`: blend_backward, unproject.
 
@@ -40,18 +56,13 @@ class CudaSplatting:
     """
 
     def __init__(self, camera: Camera, stopwatch: Stopwatch | None = None) -> None:
-        self.camera, self.stopwatch = camera, stopwatch
-        self.tiles_x = -(-camera.width // TILE)
-        self.tiles = self.tiles_x * -(-camera.height // TILE)
-        self._camera = runtime.to_device([camera.fx, camera.fy, camera.cx, camera.cy])
-        self._start = runtime.zeros((self.tiles + 1,), np.int32)
-        self._stop = runtime.zeros((self.tiles, WARPS), np.int32)
-        self._no_weight = runtime.zeros((1, 1))
-        self._no_embedding = runtime.zeros((1, 1, 3))
+        self.camera, self.stopwatch, self._tiling = camera, stopwatch, Tiling.of(camera)
+        self._intrinsics = runtime.to_device(camera.intrinsics)
+        self._tiles = _TileBuffers(self._tiling.count)
+        self._absent = AbsentGradient.of_size(1, 1)
         self._pose_gradient = runtime.zeros((6,))
         self._sort, self._prefix_sums = RadixSort(), PrefixSums()
-        self._slots = Pairs(1 << 15)  # tile, Gaussian
-        self._reached = runtime.empty((self._slots.capacity,), np.int32)
+        self._slots = _SlotBuffers(1 << 15)
         self._splats = _SplatBuffers(1)
         self.slot_count = 0
 
@@ -63,18 +74,21 @@ class CudaSplatting:
     @property
     def pair_count(self) -> int:
         """(splat, pixel) pairs that the last `forward` blended, in whole warps: `backward` takes the same ones."""
-        return WARP * int(rasterize.count_passes(self.slot_count, self._slots.keys, self._reached, self._stop))
+        return WARP * int(
+            rasterize.count_passes(self.slot_count, self._slots.keys, self._slots.reached, self._tiles.stop)
+        )
 
     def forward(self, gaussians: Splats, pose: np.ndarray, with_embedding: bool, images: RenderImages) -> None:
         """Render into `images`. pose: device array [12], rows of [R | t] of T_cw."""
         with stage(self.stopwatch, "project"):
             self._project(gaussians, pose, with_embedding)
         with stage(self.stopwatch, "list"):
-            self._list_slots(gaussians.count)
+            slots = self._list_slots(gaussians.count)
+        tiles = self._tiles
         with stage(self.stopwatch, "blend"):
             rasterize.forward(
-                self.tiles, self.tiles_x, self._start, self._slots.values, self._reached, self._splats.splat,
-                with_embedding, self._stop, images.colour, images.depth, images.opacity, images.embedding,
+                self._tiling.count, self._tiling.across, tiles.start, slots.values, slots.reached, self._splats.splat,
+                with_embedding, tiles.stop, images.colour, images.depth, images.opacity, images.embedding,
             )  # fmt: skip
 
     def backward(
@@ -83,20 +97,21 @@ class CudaSplatting:
         """Add the gradients of the last `forward` to `into`; returns the pose's [6]."""
         curvature = g.colour_weight is not None and g.depth_weight is not None
         embedding = g.embedding is not None
-        splats = self._splats
+        splats, slots, tiles, absent = self._splats, self._slots, self._tiles, self._absent
         with stage(self.stopwatch, "blend_backward"):
             splats.moments.fill(0)
             rasterize.backward(
-                self.tiles, self.tiles_x, self._start, self._slots.values, self._reached, splats.splat, self._stop,
+                self._tiling.count, self._tiling.across, tiles.start, slots.values, slots.reached, splats.splat,
+                tiles.stop,
                 embedding, curvature, images.colour, images.depth, images.opacity, images.embedding,
-                g.colour, g.depth, g.opacity, g.embedding if embedding else self._no_embedding,
-                g.colour_weight if curvature else self._no_weight, g.depth_weight if curvature else self._no_weight,
+                g.colour, g.depth, g.opacity, g.embedding if embedding else absent.embedding,
+                g.colour_weight if curvature else absent.weight, g.depth_weight if curvature else absent.weight,
                 splats.moments,
             )  # fmt: skip
         with stage(self.stopwatch, "unproject"):
             projection_gradient.project_backward(
                 gaussians.count, gaussians.mean, gaussians.log_scale, gaussians.quat_wxyz, gaussians.opacity_logit,
-                splats.splat, pose, self._camera, self.camera.width, self.camera.height, embedding,
+                splats.splat, pose, self._intrinsics, self.camera.width, self.camera.height, embedding,
                 splats.tile_count, splats.moments, into.mean, into.log_scale, into.quat_wxyz, into.opacity_logit,
                 into.colour, into.embedding, into.curvature, splats.pose_rows,
             )  # fmt: skip
@@ -109,24 +124,26 @@ class CudaSplatting:
         splats = self._splats
         projection.project(
             gaussians.count, gaussians.mean, gaussians.log_scale, gaussians.quat_wxyz, gaussians.opacity_logit,
-            gaussians.colour, gaussians.embedding, pose, self._camera, self.camera.width, self.camera.height,
+            gaussians.colour, gaussians.embedding, pose, self._intrinsics, self.camera.width, self.camera.height,
             with_embedding, splats.splat, splats.tile_rect, splats.tile_count,
         )  # fmt: skip
 
-    def _list_slots(self, count: int) -> None:
+    def _list_slots(self, count: int) -> _SlotBuffers:
         """List each tile's splats in depth order (equal depths by index)."""
         splats, order = self._splats, self._splats.by_depth
         rasterize.depth_keys(count, splats.tile_count, splats.splat, order.keys, order.values)
         self._sort(order, count, rasterize.DEPTH_BITS)
         self.slot_count = self._prefix_sums(splats.tile_count, order.values, count, splats.first_of)
         if self.slot_count > self._slots.capacity:
-            self._slots = Pairs(max(2 * self._slots.capacity, self.slot_count))
-            self._reached = runtime.empty((self._slots.capacity,), np.int32)
+            self._slots = _SlotBuffers(max(2 * self._slots.capacity, self.slot_count))
         slots = self._slots
         rasterize.list_slots(
-            self.slot_count, count, order.values, splats.first_of, splats.tile_rect, self.tiles_x,
+            self.slot_count, count, order.values, splats.first_of, splats.tile_rect, self._tiling.across,
             slots.keys, slots.values,
         )  # fmt: skip
-        self._sort(slots, self.slot_count, (self.tiles - 1).bit_length())
-        rasterize.find_starts(self.slot_count, self.tiles, slots.keys, self._start)
-        rasterize.find_reach(self.slot_count, self.tiles_x, slots.keys, slots.values, splats.splat, self._reached)
+        self._sort(slots, self.slot_count, (self._tiling.count - 1).bit_length())
+        rasterize.find_starts(self.slot_count, self._tiling.count, slots.keys, self._tiles.start)
+        rasterize.find_reach(
+            self.slot_count, self._tiling.across, slots.keys, slots.values, splats.splat, slots.reached
+        )
+        return slots

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tgslam.device import runtime
+
 
 @dataclass
 class RenderImages:
@@ -27,3 +29,16 @@ class ImageGradient:
     embedding: np.ndarray | None = None  # [H, W, 3]
     colour_weight: np.ndarray | None = None  # [H, W]
     depth_weight: np.ndarray | None = None  # [H, W]
+
+
+@dataclass(frozen=True)
+class AbsentGradient:
+    """In place of what an `ImageGradient` leaves out: kernels take the arrays, and do not read them."""
+
+    weight: np.ndarray  # [H, W]
+    embedding: np.ndarray  # [H, W, 3]
+
+    @classmethod
+    def of_size(cls, height: int, width: int) -> AbsentGradient:
+        """Zeros."""
+        return cls(runtime.zeros((height, width)), runtime.zeros((height, width, 3)))

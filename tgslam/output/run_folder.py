@@ -69,19 +69,71 @@ class RunFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.trajectory = path / "trajectory.txt"
-        self.keyframes = path / "keyframes.txt"
-        self.map = path / "map.ply"
-        self.planes = path / "planes.json"
-        self.planes_mesh = path / "planes.glb"
-        self.floorplan = path / "floorplan.svg"
-        self.map_planes = path / "map_planes.ply"
-        self.metrics = path / "metrics.json"
-        self.log = path / "log.jsonl"
-        self.config = path / "config.yaml"
-        self.record = path / self.RECORD
-        self.partial_trajectory = path / "partial_trajectory.txt"
-        self.partial_map = path / "partial_map.ply"
+
+    @property
+    def trajectory(self) -> Path:
+        """Poses of every frame."""
+        return self.path / "trajectory.txt"
+
+    @property
+    def keyframes(self) -> Path:
+        """Poses of the keyframes."""
+        return self.path / "keyframes.txt"
+
+    @property
+    def map(self) -> Path:
+        """The Gaussians; what PLY has no place for lies beside it."""
+        return self.path / "map.ply"
+
+    @property
+    def planes(self) -> Path:
+        """The planes."""
+        return self.path / "planes.json"
+
+    @property
+    def planes_mesh(self) -> Path:
+        """The planes as a mesh."""
+        return self.path / "planes.glb"
+
+    @property
+    def floorplan(self) -> Path:
+        """The planes from above."""
+        return self.path / "floorplan.svg"
+
+    @property
+    def map_planes(self) -> Path:
+        """The Gaussians in the colours of their planes."""
+        return self.path / "map_planes.ply"
+
+    @property
+    def metrics(self) -> Path:
+        """What the run has been measured to."""
+        return self.path / "metrics.json"
+
+    @property
+    def log(self) -> Path:
+        """A line a frame."""
+        return self.path / "log.jsonl"
+
+    @property
+    def config(self) -> Path:
+        """Every setting of the run."""
+        return self.path / "config.yaml"
+
+    @property
+    def record(self) -> Path:
+        """What kind of run it was."""
+        return self.path / self.RECORD
+
+    @property
+    def partial_trajectory(self) -> Path:
+        """Poses as of the last keyframe, of a run that goes on or was killed."""
+        return self.path / "partial_trajectory.txt"
+
+    @property
+    def partial_map(self) -> Path:
+        """The map likewise."""
+        return self.path / "partial_map.ply"
 
     @classmethod
     def create(cls, path: Path, overwrite: bool) -> RunFolder:

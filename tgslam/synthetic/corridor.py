@@ -10,8 +10,8 @@ from tgslam.synthetic.scene import Lighting, Scene, SceneBuilder, Vector
 LEG_M = 12.0  # between corners
 WIDTH_M = 2.0
 HEIGHT_M = 2.5
-SPEED_M_S = 0.55
-_DOOR_STEP_M = 3.0
+SPEED_M_S = 0.55  # of the camera along it: a slow walk
+_DOOR_STEP_M = 3.0  # between doors of one wall
 _START_M = 1.2  # room behind the camera's first position
 
 

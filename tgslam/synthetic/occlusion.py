@@ -10,8 +10,8 @@ from scipy.ndimage import gaussian_filter
 
 from tgslam.kernels.raycast import BOX, CYLINDER, QUAD
 
-VOXEL_M = 0.06
-_BLUR_M = 0.13
+VOXEL_M = 0.06  # finer than what is blurred
+_BLUR_M = 0.13  # standard deviation: how far into a room a corner is seen to be dark
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Exact areas of a scene's planes, and exact distances to its surfaces."""
+"""Exact distances to a scene's surfaces."""
 
 from __future__ import annotations
 
@@ -7,22 +7,8 @@ import numpy as np
 from tgslam.kernels.raycast import BOX, CYLINDER, QUAD
 from tgslam.synthetic.scene import Scene, Vector
 
-_BISECTIONS = 60
+_BISECTIONS = 60  # to the last digit of a float64
 _LEAST_M = 1e-9  # a coordinate of 0 is taken as this: distances change by no more
-
-
-def plane_areas_m2(scene: Scene) -> Vector:
-    """[P] area of the face on each plane, what is hidden of it included; what is painted on it adds nothing."""
-    areas = np.zeros(len(scene.planes_w))
-    for (shape, _, first, layer), half in zip(scene.meta, scene.half_m, strict=True):
-        x, y, z = half
-        if shape == QUAD and layer == 0:
-            areas[first] = 4 * x * y
-        elif shape == BOX:
-            areas[first : first + 6] = 4 * np.array([y * z, y * z, x * z, x * z, x * y, x * y])
-        elif shape == CYLINDER:
-            areas[first : first + 2] = np.pi * x * y
-    return areas
 
 
 def surface_distance_m(scene: Scene, points_w: Vector) -> Vector:

@@ -81,7 +81,7 @@ class Raycaster:
 
     def __init__(self, scene: Scene, camera: Camera) -> None:
         self._scene, self._camera = scene, camera
-        self._intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+        self._intrinsics = camera.intrinsics.tolist()
         self._material_kind = runtime.to_device(scene.material_kind, np.int32)
         self._material = runtime.to_device(scene.material)
         self._occlusion = runtime.to_device(scene.occlusion.share)
@@ -95,7 +95,7 @@ class Raycaster:
         local = camera_scene(self._scene, self._camera, T_wc)
         primitives, lists = self._primitives(local)
         view = self._cast(primitives, lists)
-        colour = runtime.empty((self._camera.height, self._camera.width, 3))
+        colour = runtime.empty((*self._camera.shape, 3))
         kernels.shade(
             *primitives,
             self._material_kind,
@@ -123,7 +123,7 @@ class Raycaster:
         return (meta, axes, origin, half_m), (runtime.to_device(local.near_m), counts, lists)
 
     def _cast(self, primitives: DeviceArrays, lists: DeviceArrays) -> View:
-        shape = (self._camera.height, self._camera.width)
+        shape = self._camera.shape
         depth_m, cosine = runtime.empty(shape), runtime.empty(shape)
         primitive, label = runtime.empty(shape, np.int32), runtime.empty(shape, np.int32)
         kernels.cast(*primitives, *lists, *self._intrinsics, depth_m, primitive, label, cosine)

@@ -12,7 +12,7 @@ from tgslam.synthetic import corridor, paths, rooms
 from tgslam.synthetic.paths import CameraPath
 from tgslam.synthetic.scene import Scene
 
-FRAME_RATE_HZ = 30.0
+FRAME_RATE_HZ = 30.0  # as depth cameras have
 
 
 @dataclass(frozen=True)

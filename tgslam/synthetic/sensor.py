@@ -9,17 +9,18 @@ from scipy.special import ndtri
 
 from tgslam.types import FloatImage
 
-DEPTH_SIGMA_PER_M2 = 0.0015  # sigma_z = this * z^2, 1/m
-COLOUR_SIGMA = 0.008  # intensity in [0, 1]
-MIN_RANGE_M, MAX_RANGE_M = 0.4, 7.0
-EXPOSURE_PERIOD_S = 6.0
+DEPTH_SIGMA_PER_M2 = 0.0015  # sigma_z = this * z^2, 1/m, like the Kinect's
+COLOUR_SIGMA = 0.008  # intensity in [0, 1]: two steps of 8 bits
+MIN_RANGE_M, MAX_RANGE_M = 0.4, 7.0  # of such a sensor
+EXPOSURE_PERIOD_S = 6.0  # slow enough for neighbouring frames to look alike
 
 _FOCAL_BASELINE_PX_M = 580.0 * 0.075  # of the sensor that sees disparity, whatever the resolution of the frames
-_DISPARITY_STEP_PX = 0.125
+_DISPARITY_STEP_PX = 0.125  # in which it measures disparity
 _SMOOTHING_PX = 0.7  # disparity noise is correlated between neighbours
 _GRAZING_COSINE = 0.14  # below: no return
 _EDGE_JUMP = 0.03  # relative depth step that counts as an edge
-_EDGE_HOLE_SHARE = 0.6
+_EDGE_HOLE_SHARE = 0.6  # of the pixels at an edge without depth
+# Of the normal distribution, looked up by 16 random bits: cheaper than to draw from it
 _NORMAL_QUANTILES = ndtri((np.arange(1 << 16) + 0.5) / (1 << 16)).astype(np.float32)
 
 

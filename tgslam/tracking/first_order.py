@@ -21,7 +21,7 @@ from tgslam.ops.splats import MapGradient
 from tgslam.ops.vector_adam import VectorAdam
 from tgslam.tracking.gauss_newton import GaussNewtonTracker
 from tgslam.tracking.pyramid import finest_level
-from tgslam.tracking.reference import Reference
+from tgslam.tracking.references import Reference
 from tgslam.tracking.result import TrackingResult
 from tgslam.types import Exposure, Frame
 
@@ -33,7 +33,7 @@ class FirstOrderTracker:
         self.config, self.loss = config, loss
         self.stopwatch: Stopwatch | None = None
         self.first = finest_level(camera, config.finest_width_px)
-        self.cameras = [camera.halved(self.first + level) for level in range(len(config.first_order_iterations))]
+        self.cameras = [camera.halved(self.first + level) for level in range(len(config.expert.first_order.adam_steps))]
         self.rasterizers = [Rasterizer(level) for level in self.cameras]
         self.workspaces = [losses.Workspace(level.height, level.width) for level in self.cameras]
         self._gradient = MapGradient.zeros(1)
@@ -84,15 +84,15 @@ class FirstOrderTracker:
         exposure: Exposure,
     ) -> tuple[NDArray[np.float64], Exposure]:
         rasterizer = self.rasterizers[level]
-        rate = self.config.first_order_rate
+        rate = self.config.expert.first_order.adam_rate
         fits_gain, fits_bias = self.config.exposure != "none", self.config.exposure == "gain_bias"
         adam = VectorAdam([rate] * 6 + [rate * fits_gain, rate * fits_bias])
         to_frame = np.array([1.0 / exposure.gain, -exposure.bias / exposure.gain])  # the loss fits map to frame
-        for _ in range(self.config.first_order_iterations[level]):
+        for _ in range(self.config.expert.first_order.adam_steps[level]):
             rendered = rasterizer.forward(gaussians, T_cw)
             result = losses.rgbd_loss(
                 rendered.colour, rendered.depth, rendered.opacity, observation, self.loss, to_frame[0], to_frame[1],
-                min_opacity=self.config.min_opacity, workspace=self.workspaces[level],
+                min_opacity=self.config.expert.model.min_opacity, workspace=self.workspaces[level],
             )  # fmt: skip
             g = ImageGradient(result.g_colour, result.g_depth, result.g_opacity)
             g_pose = rasterizer.backward(gaussians, g, self._gradient)

@@ -13,7 +13,7 @@ from tgslam.map.keyframes import Keyframe
 from tgslam.map.world import Map
 from tgslam.tracking.brightness import relative_gain
 from tgslam.tracking.motion import MotionFilter
-from tgslam.tracking.reference import Reference, references_of
+from tgslam.tracking.references import Reference, references_of
 from tgslam.tracking.result import TrackingResult
 from tgslam.tracking.solver import make_tracker, track_or_recover
 from tgslam.tracking.steadying import planes_seen, steadying_planes
@@ -28,7 +28,7 @@ class FrontEnd:
     def __init__(self, camera: Camera, config: TrackingConfig, loss: LossConfig) -> None:
         self.tracker = make_tracker(camera, config, loss)
         self._camera, self._config = camera, config
-        self._motion = MotionFilter(config)
+        self._motion = MotionFilter(config.expert.motion)
         self._exposure = Exposure()
 
     def track(self, frame: Frame, world: Map, latest_T_cw: Matrix4) -> TrackingResult:

@@ -26,7 +26,7 @@ from tgslam.tracking.pyramid import (
     ReferencePyramid,
     finest_level,
 )
-from tgslam.tracking.reference import NO_PLANES, Reference
+from tgslam.tracking.references import NO_PLANES, Reference
 from tgslam.tracking.result import TrackingResult
 from tgslam.types import Exposure, Frame
 
@@ -57,15 +57,19 @@ class GaussNewtonTracker:
     def __init__(self, camera: Camera, config: TrackingConfig, loss: LossConfig) -> None:
         self.config = config
         self.stopwatch: Stopwatch | None = None
-        self.detector = LostDetector(config)
+        self.detector = LostDetector(config.expert.lost)
         self.rasterizer = Rasterizer(camera)
         self._planes_w = NO_PLANES
-        first, levels = finest_level(camera, config.finest_width_px), len(config.iterations)
+        first, levels = finest_level(camera, config.finest_width_px), len(config.alignment_steps)
         self._live_pyramid = LivePyramid(camera, first, levels, loss)
-        self._model_pyramid = ModelPyramid(camera, first, levels, loss, config.min_opacity, config.rim_opacity)
-        self._reference_pyramids = [ReferencePyramid(camera, first, levels, loss) for _ in range(config.references)]
+        self._model_pyramid = ModelPyramid(camera, first, levels, loss.noise, config.expert.model)
+        self._reference_pyramids = [
+            ReferencePyramid(camera, first, levels, loss.noise) for _ in range(config.references)
+        ]
         self._references: list[tuple[list[ModelLevel], Reference]] = []
-        self._linearise = [Lineariser(level.camera, config, loss) for level in self._live_pyramid.levels]
+        self._linearise = [
+            Lineariser(level.camera, config.expert.residuals, loss) for level in self._live_pyramid.levels
+        ]
 
     def know(self, planes_w: NDArray[np.float64], references: Sequence[Reference]) -> None:
         """See `Tracker.know`."""
@@ -84,10 +88,11 @@ class GaussNewtonTracker:
         prior: NDArray[np.float64] | None = None,
     ) -> TrackingResult:
         """See `Tracker.track`."""
-        predicted, prior = T_cw, np.zeros((6, 6)) if prior is None else self.config.correlated_px * prior
+        predicted, correlated_px = T_cw, self.config.expert.residuals.correlated_px
+        prior = np.zeros((6, 6)) if prior is None else correlated_px * prior
         with stage(self.stopwatch, "pyramid"):
             live = self._live_pyramid.update(frame)
-        for _ in range(self.config.renders):
+        for _ in range(self.config.expert.model.renders):
             model = self._model(gaussians, T_cw)
             with stage(self.stopwatch, "align"):
                 T_ml, exposure, last = self._align(live, model, T_cw, exposure, predicted @ inverse(T_cw), prior)
@@ -105,7 +110,7 @@ class GaussNewtonTracker:
     def _result(
         self, T_cw: NDArray[np.float64], T_ml: NDArray[np.float64], exposure: Exposure, last: NormalEquations
     ) -> TrackingResult:
-        information = adjoint(T_ml).T @ last.A @ adjoint(T_ml) / self.config.correlated_px
+        information = adjoint(T_ml).T @ last.A @ adjoint(T_ml) / self.config.expert.residuals.correlated_px
         measures = {
             "inlier_ratio": last.inliers / max(last.matched, 1.0),
             "overlap": last.candidates / max(last.live_pixels, 1.0),
@@ -148,7 +153,7 @@ class GaussNewtonTracker:
         T_ml = np.eye(4)
         matches = [_Match.of(levels, reference, T_mw, exposure) for levels, reference in self._references]
         for level in reversed(range(len(live))):
-            for _ in range(self.config.iterations[level]):
+            for _ in range(self.config.alignment_steps[level]):
                 others = [(self._of_reference(match, level, live[level], T_ml), match.T_rm) for match in matches]
                 backed = any(other.matched >= _BACKED * other.live_pixels for other, _ in others)
                 equations = self._linearise[level](live[level], model[level], T_ml, exposure, backed=backed)

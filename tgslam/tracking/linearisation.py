@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tgslam.camera import Camera
 from tgslam.config.map_settings import LossConfig
-from tgslam.config.tracking_settings import TrackingConfig
+from tgslam.config.tracking_settings import ResidualSettings
 from tgslam.geometry import adjoint
 from tgslam.ops.alignment import NormalSums, layout
 from tgslam.tracking.exposure import IntensityMoments
@@ -51,7 +51,7 @@ class NormalEquations:
 class Lineariser:
     """Evaluates Eqs. 12, 13 (without SSIM) between one resolution of a frame and of the model; holds the scratch."""
 
-    def __init__(self, camera: Camera, config: TrackingConfig, loss: LossConfig) -> None:
+    def __init__(self, camera: Camera, config: ResidualSettings, loss: LossConfig) -> None:
         self._config = config
         self._settings = np.zeros(layout.SETTINGS, np.float32)
         for entry, value in {
@@ -59,10 +59,10 @@ class Lineariser:
             layout.FY: camera.fy,
             layout.CX: camera.cx,
             layout.CY: camera.cy,
-            layout.DEPTH_SIGMA: loss.depth_sigma_per_m2,
+            layout.DEPTH_SIGMA: loss.noise.per_m2,
             layout.MAX_DISTANCE_SIGMAS: config.max_distance_sigmas,
-            layout.CHARBONNIER_DEPTH: loss.charbonnier_depth_sigmas,
-            layout.GATE_DEPTH_BOOST: loss.gate_depth_boost,
+            layout.CHARBONNIER_DEPTH: loss.expert.penalties.charbonnier_depth_sigmas,
+            layout.GATE_DEPTH_BOOST: loss.expert.texture.gate_depth_boost,
             layout.SIGMA_COLOUR: config.sigma_colour,
             layout.SIGMA_GRADIENT: config.sigma_gradient,
             layout.SURFACE_SIGMA: config.surface_sigma_m,

@@ -6,10 +6,10 @@ from collections import deque
 
 import numpy as np
 
-from tgslam.config.tracking_settings import TrackingConfig
+from tgslam.config.tracking_settings import LostSettings
 
-_HISTORY = 30  # tracked frames whose colour residual says what is usual here
-_MIN_HISTORY = 3
+_HISTORY = 30  # tracked frames whose colour residual says what is usual here: a second
+_MIN_HISTORY = 3  # of them, for their median to say anything
 
 
 class LostDetector:
@@ -19,8 +19,8 @@ class LostDetector:
     should meet does not (`agreement`), and that the colours are off by far more than they were.
     """
 
-    def __init__(self, config: TrackingConfig) -> None:
-        self.config = config
+    def __init__(self, config: LostSettings) -> None:
+        self._config = config
         self._colour_residuals: deque[float] = deque(maxlen=_HISTORY)
 
     def judge(self, measures: dict[str, float]) -> str:
@@ -30,16 +30,16 @@ class LostDetector:
         inlier_ratio (of those, within three sigma of the surface), colour_residual (intensity), condition (of the
         pose's information matrix).
         """
-        config, usual = self.config, self._usual_colour_residual()
-        if measures["overlap"] < config.lost_overlap:
+        config, usual = self._config, self._usual_colour_residual()
+        if measures["overlap"] < config.min_map_overlap:
             return f"only {measures['overlap']:.0%} of the frame meets the map"
-        if measures["agreement"] < config.lost_agreement:
+        if measures["agreement"] < config.min_map_agreement:
             return f"only {measures['agreement']:.0%} of what meets the map has its depth"
-        if measures["inlier_ratio"] < config.lost_inlier_ratio:
+        if measures["inlier_ratio"] < config.min_inlier_ratio:
             return f"only {measures['inlier_ratio']:.0%} of the matched pixels lie within three sigma"
         if measures["colour_residual"] > usual:
             return f"the colours are off by {measures['colour_residual']:.2f}, more than {usual:.2f}"
-        if not measures["condition"] < config.lost_condition:
+        if not measures["condition"] < config.max_condition:
             return f"the pose is not determined (condition number {measures['condition']:.1e})"
         self._colour_residuals.append(measures["colour_residual"])
         return ""
@@ -48,4 +48,4 @@ class LostDetector:
         if len(self._colour_residuals) < _MIN_HISTORY:
             return np.inf
         median = float(np.median(self._colour_residuals))
-        return max(self.config.lost_colour_ratio * median, self.config.lost_colour_residual)
+        return max(self._config.max_colour_ratio * median, self._config.sound_colour_residual)

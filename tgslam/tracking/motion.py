@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.config.tracking_settings import TrackingConfig
+from tgslam.config.tracking_settings import MotionSettings
 from tgslam.geometry import inverse, se3_exp, se3_log
 
-_LEAST_S = 1.0 / 120.0  # between frames whose timestamps say less
+_LEAST_S = 1.0 / 120.0  # between frames whose timestamps say less: no camera is faster
 
 
 class MotionFilter:
@@ -19,7 +19,7 @@ class MotionFilter:
     perturbation's axes turn with the camera from a frame to the next is neglected in the covariances.
     """
 
-    def __init__(self, config: TrackingConfig) -> None:
+    def __init__(self, config: MotionSettings) -> None:
         self._acceleration = np.diag(np.array([config.acceleration_rad] * 3 + [config.acceleration_m] * 3) ** 2)
         self._rest = np.diag(np.array([config.speed_rad] * 3 + [config.speed_m] * 3) ** 2)
         self._last: tuple[float, NDArray[np.float64]] | None = None

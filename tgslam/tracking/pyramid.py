@@ -11,13 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.camera import Camera
+from tgslam.camera import Camera, SensorNoise
 from tgslam.config.map_settings import LossConfig
+from tgslam.config.tracking_settings import ModelSettings
 from tgslam.device import runtime
 from tgslam.ops import alignment
 from tgslam.ops import image as images
+from tgslam.ops.normals import PlaneFits
 from tgslam.ops.rasterize import RenderImages
-from tgslam.tracking.reference import NO_PLANES, Reference
+from tgslam.tracking.references import NO_PLANES, Reference
 from tgslam.types import Frame
 
 # blocks of 2x2 px on each side: a rendered surface has little noise, and wide fits of a measured one round its edges
@@ -73,26 +75,21 @@ class LivePyramid:
         """G_min and 1 / (G_max - G_min + epsilon) of Eq. 11, from a grid of pixels. sample: memory for it."""
         if not self.loss.gate:
             return images.UNGATED
-        alignment.sample_strength(level.pixels, images.sample_step((level.camera.height, level.camera.width)), sample)
-        return images.gate_range(runtime.to_host(sample), self.loss.gate_percentile, self.loss.gate_noise_floor)
+        alignment.sample_strength(level.pixels, images.sample_step(level.camera.shape), sample)
+        texture = self.loss.expert.texture
+        return images.gate_range(runtime.to_host(sample), texture.gate_percentile, texture.gate_noise_floor)
 
 
 class ModelPyramid:
     """Levels of a rendering of the map, finest first, of the same sizes as those of `LivePyramid`."""
 
-    def __init__(
-        self, camera: Camera, first: int, levels: int, loss: LossConfig, min_opacity: float, rim_opacity: float
-    ) -> None:
-        """min_opacity: pixels that the map covers no more than that are left out.
-
-        rim_opacity: and those round which it covers less than that in the mean are marked as its rim.
-        """
-        self.min_opacity, self._rim_opacity = min_opacity, rim_opacity
+    def __init__(self, camera: Camera, first: int, levels: int, noise: SensorNoise, config: ModelSettings) -> None:
+        self._config = config
         self._images = _ImagePyramid(camera, first, levels)
         self.levels = [_model_level(camera.halved(first + level)) for level in range(levels)]
         sizes = [pair.grey.shape for pair in self._images.pairs]
         self._covers = [runtime.empty(size) for size in (*sizes, images.halved(sizes[-1]))]
-        self._fits = [images.PlaneFits(level.camera, _NORMAL_RADIUS, loss.depth_sigma_per_m2) for level in self.levels]
+        self._fits = [PlaneFits(level.camera, _NORMAL_RADIUS, noise) for level in self.levels]
 
     def update(self, rendered: RenderImages, planes_c: NDArray[np.float64] = NO_PLANES) -> list[ModelLevel]:
         """Take in a rendering at full size; the result is valid until the next one.
@@ -102,24 +99,30 @@ class ModelPyramid:
         """
         base = self._images.base
         images.reduce_rendering(
-            rendered.colour, rendered.depth, rendered.opacity, self.min_opacity, base.grey, base.depth, self._covers[0]
+            rendered.colour,
+            rendered.depth,
+            rendered.opacity,
+            self._config.min_opacity,
+            base.grey,
+            base.depth,
+            self._covers[0],
         )
         for cover, half in itertools.pairwise(self._covers):
             images.halve(cover, half)
         half_covers = self._covers[-len(self.levels) :]
         for level, pair, fits, cover in zip(self.levels, self._images.halvings(), self._fits, half_covers, strict=True):
             _write_model(level, pair, fits, planes_c)
-            images.mark_rims(cover, self._rim_opacity, level.surface)
+            images.mark_rims(cover, self._config.rim_opacity, level.surface)
         return self.levels
 
 
 class ReferencePyramid:
     """Levels of a keyframe's own images, made just like those of the frame that is aligned to them."""
 
-    def __init__(self, camera: Camera, first: int, levels: int, loss: LossConfig) -> None:
+    def __init__(self, camera: Camera, first: int, levels: int, noise: SensorNoise) -> None:
         self._images = _ImagePyramid(camera, first, levels)
         self.levels = [_model_level(camera.halved(first + level), measured=True) for level in range(levels)]
-        self._fits = [images.PlaneFits(level.camera, _NORMAL_RADIUS, loss.depth_sigma_per_m2) for level in self.levels]
+        self._fits = [PlaneFits(level.camera, _NORMAL_RADIUS, noise) for level in self.levels]
 
     def update(self, reference: Reference) -> list[ModelLevel]:
         """Take in a keyframe; the result is valid until the next one."""
@@ -140,7 +143,7 @@ class _Pair:
 
     @classmethod
     def empty(cls, camera: Camera) -> _Pair:
-        return cls(runtime.empty((camera.height, camera.width)), runtime.empty((camera.height, camera.width)))
+        return cls(runtime.empty(camera.shape), runtime.empty(camera.shape))
 
 
 class _ImagePyramid:
@@ -167,17 +170,16 @@ def _live_level(camera: Camera) -> LiveLevel:
 
 
 def _model_level(camera: Camera, *, measured: bool = False) -> ModelLevel:
-    size = (camera.height, camera.width)
-    surface, texture = runtime.zeros((*size, alignment.SURFACE)), runtime.zeros((*size, alignment.TEXTURE))
+    surface, texture = (runtime.zeros((*camera.shape, values)) for values in (alignment.SURFACE, alignment.TEXTURE))
     return ModelLevel(camera, surface, texture, measured)
 
 
-def _write_model(level: ModelLevel, pair: _Pair, fits: images.PlaneFits, planes_c: NDArray[np.float64]) -> None:
+def _write_model(level: ModelLevel, pair: _Pair, fits: PlaneFits, planes_c: NDArray[np.float64]) -> None:
     alignment.pack_texture(pair.grey, level.texture)
     fits.write(pair.depth, level.surface)
     fits.adopt(planes_c, level.surface, measured=level.measured)
 
 
 def _sample_for(camera: Camera) -> np.ndarray:
-    step = images.sample_step((camera.height, camera.width))
+    step = images.sample_step(camera.shape)
     return runtime.empty((-(-camera.height // step), -(-camera.width // step)))

@@ -17,7 +17,7 @@ from tgslam.map.gaussians import GaussianMap
 from tgslam.ops.rasterize import Rasterizer
 from tgslam.tracking.first_order import FirstOrderTracker
 from tgslam.tracking.gauss_newton import GaussNewtonTracker
-from tgslam.tracking.reference import Reference
+from tgslam.tracking.references import Reference
 from tgslam.tracking.result import TrackingResult
 from tgslam.types import Exposure, Frame
 

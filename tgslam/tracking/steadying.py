@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from tgslam.geometry import inverse
 from tgslam.map.world import Map
-from tgslam.tracking.reference import NO_PLANES
+from tgslam.tracking.references import NO_PLANES
 
 # Of the pixels' normals, that planes give the camera in each direction at least: measured normals are off by 0.1 to 0.2
 # rad, so that noise alone gives 1 to 3 %

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from tests.cuda.harness import scenario
-from tgslam.camera import Camera
+from tgslam.camera import Camera, SensorNoise
 from tgslam.device import runtime
 from tgslam.ops import depth
 from tgslam.ops import image as images
+from tgslam.ops.normals import normals_of
 
-_SIGMA_PER_M2 = 0.0015
+_NOISE = SensorNoise(0.0015)
 
 
 def _rgbd(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -48,6 +49,6 @@ def geometry(height: int = 37, width: int = 50) -> dict[str, np.ndarray]:
     camera = Camera(width, height, 45.0, 48.0, 24.3, 18.9)
     return _on_host(
         half=images.halve_depth(depth_m),
-        supported=depth.without_flying_pixels(depth_m, _SIGMA_PER_M2, camera.fx),
-        normals=images.normals(depth_m, camera),
+        supported=depth.without_flying_pixels(depth_m, _NOISE, camera.fx),
+        normals=normals_of(depth_m, camera, _NOISE),
     )

@@ -213,6 +213,6 @@ def _slot_lists(rasterizer: Rasterizer) -> dict[str, np.ndarray]:
     stages = rasterizer._splatting
     ids = stages._slots.ids if isinstance(stages, CpuSplatting) else stages._slots.values
     return {
-        "start": runtime.to_host(stages._start).copy(),
+        "start": runtime.to_host(stages._tiles.start).copy(),
         "ids": runtime.to_host(ids)[: rasterizer.slot_count].copy(),
     }

@@ -23,8 +23,7 @@ def _frame(camera: Camera, index: int) -> Frame:
     normals_w, offsets_m = _CORNER
     length = np.linalg.norm(normals_w, axis=1)
     normals_c = normals_w / length[:, None] @ T_cw[:3, :3].T
-    v, u = np.mgrid[: camera.height, : camera.width]
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    rays = camera.rays()
     depths = -(offsets_m / length - normals_c @ T_cw[:3, 3]) / (rays @ normals_c.T)
     depth_m = np.where(depths > 0, depths, np.inf).min(axis=-1)
     x, y, z = np.moveaxis(rays * depth_m[..., None] @ inverse(T_cw)[:3, :3].T + inverse(T_cw)[:3, 3], -1, 0)

@@ -7,7 +7,7 @@ import numpy as np
 from tests.cuda.harness import scenario
 from tgslam.camera import Camera
 from tgslam.config.map_settings import LossConfig
-from tgslam.config.tracking_settings import TrackingConfig
+from tgslam.config.tracking_settings import ModelSettings, ResidualSettings
 from tgslam.device import runtime
 from tgslam.geometry import se3_exp
 from tgslam.kernels import alignment
@@ -17,8 +17,7 @@ from tgslam.tracking.pyramid import LivePyramid, ModelPyramid
 from tgslam.types import Exposure, Frame
 
 _LOSS = LossConfig()
-_MIN_OPACITY = 0.5
-_RIM_OPACITY = 0.9
+_MODEL = ModelSettings(min_opacity=0.5, rim_opacity=0.9)
 
 
 def _view(height: int, width: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -56,9 +55,7 @@ def levels(height: int = 37, width: int = 50, first: int = 1) -> dict[str, np.nd
     camera = _camera(height, width)
     live = LivePyramid(camera, first, 2, _LOSS).update(Frame(0, 0.0, *_view(height, width, seed=0)))
     planes_c = np.array([[*facing, 1.95] for facing in (_slanted(camera), -np.eye(3)[2])])
-    model = ModelPyramid(camera, first, 2, _LOSS, _MIN_OPACITY, _RIM_OPACITY).update(
-        _rendering(height, width), planes_c
-    )
+    model = ModelPyramid(camera, first, 2, _LOSS.noise, _MODEL).update(_rendering(height, width), planes_c)
     result = {}
     for k in range(2):
         result[f"gate_{k}"] = np.array([live[k].gate_low, live[k].gate_inverse_range])
@@ -73,9 +70,9 @@ def normal_equations(height: int = 37, width: int = 50) -> dict[str, np.ndarray]
     """The equations at a pose and an exposure off the true ones."""
     camera = _camera(height, width)
     (live,) = LivePyramid(camera, 0, 1, _LOSS).update(Frame(0, 0.0, *_view(height, width, seed=0)))
-    (model,) = ModelPyramid(camera, 0, 1, _LOSS, _MIN_OPACITY, _RIM_OPACITY).update(_rendering(height, width))
+    (model,) = ModelPyramid(camera, 0, 1, _LOSS.noise, _MODEL).update(_rendering(height, width))
     T_ml = se3_exp([0.02, -0.03, 0.015, 0.02, -0.015, 0.03])
-    found = Lineariser(camera, TrackingConfig(), _LOSS)(live, model, T_ml, Exposure(1.1, -0.04))
+    found = Lineariser(camera, ResidualSettings(), _LOSS)(live, model, T_ml, Exposure(1.1, -0.04))
     intensity = found.intensity
     return {
         "A": found.A,

@@ -106,13 +106,13 @@ class _Learning:
         self._codes = runtime.to_device(code_table(np.arange(self._known.max(initial=-1) + 1), config))
         self._map = GaussianMap.from_gaussians(back_projected(frame, camera, _STRIDE))
         self._rasterizer = Rasterizer(camera)
-        self._workspace = instance_field.Workspace(camera.height, camera.width)
+        self._workspace = instance_field.Workspace(*camera.shape)
         self._target = instance_field.prepare(ids, runtime.to_device(frame.depth_m), config)
         self._gradient = MapGradient.zeros(self._map.capacity)
         self._most_px = runtime.zeros((self._map.capacity,))  # it is the only view
-        self._g_opacity = runtime.zeros((camera.height, camera.width))
-        self._no_colour = runtime.zeros((camera.height, camera.width, 3))
-        self._no_depth = runtime.zeros((camera.height, camera.width))
+        self._g_opacity = runtime.zeros(camera.shape)
+        self._no_colour = runtime.zeros((*camera.shape, 3))
+        self._no_depth = runtime.zeros(camera.shape)
 
     @property
     def gaussians(self) -> int:

@@ -93,7 +93,8 @@ GATE = Study(
     scenes=("blank", "room"),
 )
 _NO_SSIM = ("loss.weight_ssim=0",)
-_NO_GRADIENT = ("loss.weight_grad=0", "tracking.weight_gradient=0")  # tracking weighs its residuals by itself
+# tracking weighs its residuals by itself
+_NO_GRADIENT = ("loss.weight_grad=0", "tracking.expert.residuals.weight_gradient=0")
 TERMS = Study(
     name="terms",
     title="the SSIM and gradient terms of the objective (Eq. 12)",

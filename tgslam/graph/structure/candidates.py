@@ -30,12 +30,12 @@ def candidates(
 ) -> list[Candidate]:
     """At most `max_edges` earlier keyframes, oldest first, for a keyframe that saw the planes `seen`.
 
-    earlier: what each keyframe before it saw; the latest `min_gap` of them count as its neighbours. T_ji: [4, 4] from
-    each of them to this one, as the graph has it; it decides on strength only. Of those that share two planes that are
-    not parallel, the strongest of each of `max_edges` equally populated spans of age is taken.
+    earlier: what each keyframe before it saw; the latest `closure_gap` of them count as its neighbours. T_ji: [4, 4]
+    from each of them to this one, as the graph has it; it decides on strength only. Of those that share two planes that
+    are not parallel, the strongest of each of `max_edges` equally populated spans of age is taken.
     """
     possible = []
-    for other in sorted(earlier)[: -config.min_gap]:
+    for other in sorted(earlier)[: -config.closure_gap]:
         found = _candidate(other, seen, earlier[other], T_ji[other], config)
         possible += [found] if found is not None else []
     spans = np.array_split(np.arange(len(possible)), config.max_edges)
@@ -59,4 +59,4 @@ def _candidate(
     sines = np.linalg.norm(np.cross(normals[:, None], normals[None]), axis=-1)
     if sines.max() < np.sin(config.min_angle_rad):
         return None
-    return Candidate(keyframe, shared, information_gain(of_planes(pairs, T_ji), config))
+    return Candidate(keyframe, shared, information_gain(of_planes(pairs, T_ji), config.expert.acceptance))

@@ -15,8 +15,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.camera import Camera
-from tgslam.config.graph_settings import ClosureConfig
+from tgslam.camera import Camera, SensorNoise
+from tgslam.config.graph_settings import AcceptanceSettings, IcpSettings
 from tgslam.device import runtime
 from tgslam.geometry import adjoint, inverse
 from tgslam.graph.relative import Measurement, PlanePairs, Quadratic, of_planes, solve
@@ -27,10 +27,10 @@ from tgslam.types import FloatImage
 Vector = NDArray[np.float64]
 
 _STEPS = 3  # at most of a round: matches change from step to step, so that they never settle to the last digit
-_LEAST_POINTS = 30  # of a plane, to fit it anew
+_LEAST_POINTS = 30  # of a plane, to fit it anew: of fewer, the view's own fit is better
 _LEAST_SHARE = 1e-3  # of the information of a plane's best known parameter that of the worst one is at least
 _BEHIND = np.array([[0.0, 0.0, -1e3]])  # m: a point that meets nothing, since arrays on a device cannot be empty
-_MAX_SQUARES = 2.0  # mean squared residual, in sigmas, of points that match something
+_MAX_SQUARES = 2.0  # mean squared residual, in sigmas, of points that match something: right ones have about 1
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class _Samples:
         """Every step-th pixel of both kinds."""
         v, u = np.mgrid[step_px // 2 : camera.height : step_px, step_px // 2 : camera.width : step_px].reshape(2, -1)
         z, ids = view.depth_m[v, u].astype(np.float64), view.plane_ids[v, u]
-        points = np.column_stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z])
+        points = camera.points_at(u, v, z)
         row = np.full(len(z), -1)
         for index, plane_id in enumerate(shared):
             row[ids == plane_id] = index
@@ -73,19 +73,24 @@ class Registration:
     """Two keyframes' points, ready to be brought together."""
 
     def __init__(
-        self, view_i: View, view_j: View, shared: Sequence[int], camera: Camera, depth_sigma_per_m2: float,
-        config: ClosureConfig,
-    ) -> None:  # fmt: skip
-        """shared: the PGIs that are matched. depth_sigma_per_m2: the sensor's noise, sigma_z = this * z^2."""
-        self._i, self._j = (_Samples.of(view, shared, camera, config.samples_px) for view in (view_i, view_j))
-        self._camera, self._sigma, self._config = camera, depth_sigma_per_m2, config
+        self,
+        views: tuple[View, View],
+        shared: Sequence[int],
+        camera: Camera,
+        noise: SensorNoise,
+        config: IcpSettings,
+        limits: AcceptanceSettings,
+    ) -> None:
+        """views: of the keyframes i and j. shared: the PGIs that are matched."""
+        self._i, self._j = (_Samples.of(view, shared, camera, config.samples_px) for view in views)
+        self._camera, self._noise, self._config, self._limits = camera, noise, config, limits
 
     def refine(self, pairs: PlanePairs, start: Measurement) -> Measurement:
         """From the motion that the views' planes gave; directions that nothing measures stay as they are there."""
         found = start
         for _ in range(self._config.icp_rounds):
             refitted = self._refitted(pairs, found.T_ji)
-            found = solve(partial(self._of_all, refitted), found.T_ji, self._config, _STEPS)
+            found = solve(partial(self._of_all, refitted), found.T_ji, self._limits, _STEPS)
         return found
 
     def _refitted(self, pairs: PlanePairs, T_ji: Vector) -> PlanePairs:
@@ -101,7 +106,7 @@ class Registration:
             axis = common.axes[:, k]
             columns += [axis, np.sum(axis * common.centroid, axis=1, keepdims=True)]
         sums = closure_fit.height_moments(
-            samples.planar, samples.row, np.hstack(columns), self._sigma, self._config.model_sigma_m
+            samples.planar, samples.row, np.hstack(columns), self._noise, self._config.flatness_sigma_m
         )
         return stacked([self._fitted_one(sums, k, common[k], own[k]) for k in range(len(sums.points))])
 
@@ -137,7 +142,13 @@ class Registration:
         """In a left perturbation of the inverse of T, which takes `moving` to `still`; None without a good match."""
         config = self._config
         found = closure_fit.surface_distances(
-            moving.others, T, still.surface_m, self._camera, self._sigma, config.model_sigma_m, config.match_distance_m
+            moving.others,
+            T,
+            still.surface_m,
+            self._camera,
+            self._noise,
+            config.flatness_sigma_m,
+            config.match_distance_m,
         )
         if found.matches < config.min_matches or found.squares > _MAX_SQUARES * found.matches:
             return None

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.graph_settings import LoopConfig
+from tgslam.config.graph_settings import FeatureSettings
 from tgslam.ops.image import DEPTH_EDGE
 from tgslam.types import FloatImage
 
@@ -36,16 +36,17 @@ class Features:
 
     def points(self, camera: Camera) -> NDArray[np.float64]:
         """[N, 3] m, camera frame."""
-        centred = (self.pixels.astype(np.float64) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-        return np.column_stack([centred, np.ones(len(self))]) * self.depth_m[:, None]
+        u, v = self.pixels.astype(np.float64).T
+        return camera.points_at(u, v, self.depth_m)
 
 
 class Detector:
-    """ORB with the config's number of features, spread over the image."""
+    """ORB with a given number of features, spread over the image."""
 
-    def __init__(self, config: LoopConfig) -> None:
-        self._count = config.features
-        self._orb = cv2.ORB.create(_SURPLUS * config.features, _LEVEL_RATIO, fastThreshold=config.corner_contrast)
+    def __init__(self, count: int, corner_contrast: int) -> None:
+        """count: of features at most. corner_contrast: of FAST corners, steps of 1/255."""
+        self._count = count
+        self._orb = cv2.ORB.create(_SURPLUS * count, _LEVEL_RATIO, fastThreshold=corner_contrast)
 
     def detect(self, colour: FloatImage, depth_m: FloatImage) -> Features:
         """Features of colour [H, W, 3] in [0, 1] whose neighbourhood in depth [H, W] m is measured and continuous."""
@@ -70,7 +71,7 @@ def grey_image(colour: FloatImage) -> NDArray[np.uint8]:
     return grey
 
 
-def matches(a: Features, b: Features, config: LoopConfig) -> NDArray[np.int64]:
+def matches(a: Features, b: Features, config: FeatureSettings) -> NDArray[np.int64]:
     """Pairs of rows [M, 2] of `a` and `b` that are each other's best, and clearly better than the next best."""
     if len(a) == 0 or len(b) == 0:
         return np.zeros((0, 2), np.int64)
@@ -81,7 +82,7 @@ def matches(a: Features, b: Features, config: LoopConfig) -> NDArray[np.int64]:
     rows, columns = np.flatnonzero(mutual), of_a[mutual]
     apart = np.linalg.norm(b.pixels[columns, None] - b.pixels, axis=2) > _DUPLICATE_PX * b.scale[columns, None]
     next_best = np.where(apart, bits[rows], _UNLIKE).min(axis=1)
-    clear = least[rows] < config.ratio * next_best
+    clear = least[rows] < config.match_ratio * next_best
     return np.column_stack([rows[clear], columns[clear]])
 
 

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.camera import Camera
+from tgslam.camera import Camera, SensorNoise
 from tgslam.config.graph_settings import LoopConfig
 from tgslam.geometry import inverse, se3_log
+from tgslam.graph.findings import Closure, Findings, Relative
 from tgslam.graph.gating import passes
-from tgslam.graph.structure.search import Closure, Findings, Relative
 from tgslam.graph.visual.depth_agreement import DepthGrid
 from tgslam.graph.visual.features import Detector
 from tgslam.graph.visual.retrieval import Retrieval
@@ -40,11 +40,10 @@ class _Verified:
 class LoopSearch:
     """Compares each keyframe with the earlier ones that look most alike; it remembers all that it is given."""
 
-    def __init__(self, camera: Camera, depth_sigma_per_m2: float, config: LoopConfig) -> None:
-        """depth_sigma_per_m2: the sensor's noise, sigma_z = this * z^2."""
+    def __init__(self, camera: Camera, noise: SensorNoise, config: LoopConfig) -> None:
         self._camera, self._config = camera, config
-        self._detector, self._retrieval = Detector(config), Retrieval()
-        self._verification = Verification(camera, depth_sigma_per_m2, config)
+        self._detector, self._retrieval = Detector(config.features, config.expert.matching.corner_contrast), Retrieval()
+        self._verification = Verification(camera, noise, config)
         self._keyframes: list[int] = []  # in the order they came in
         self._looks: list[Look] = []
 
@@ -67,14 +66,14 @@ class LoopSearch:
             return Findings((), unconfirmed, gated=0)
         measured = self._verification.refined(best.same, self._looks[best.order], look)
         T_ji, covariance = relative(best.keyframe, keyframe)
-        drift = self._config.understated**2 * covariance
-        if not passes(measured, T_ji, drift, self._config.gate_probability):
+        drift = self._config.expert.confirmation.understated**2 * covariance
+        if not passes(measured, T_ji, drift, self._config.expert.acceptance.gate_probability):
             return Findings((), unconfirmed, gated=1)
         return Findings((Closure(best.keyframe, (), measured),), unconfirmed, gated=0)
 
     def _alike(self, scores: Vector) -> list[int]:
         """The most alike of the earlier keyframes that are no neighbours, best first; of equal ones the oldest."""
-        old = scores[: max(len(scores) - self._config.min_gap, 0)]
+        old = scores[: max(len(scores) - self._config.loop_gap, 0)]
         best = np.argsort(-old, kind="stable")[: self._config.candidates]
         return [int(order) for order in best if old[order] > 0.0]
 
@@ -94,9 +93,10 @@ class LoopSearch:
 
     def _confirms(self, other: _Verified, one: _Verified, T_cw: Mapping[int, Vector]) -> bool:
         """Whether two earlier keyframes, near to each other, see the present one at the same place."""
-        if abs(other.order - one.order) > self._config.partner_gap:
+        limits = self._config.expert.confirmation
+        if abs(other.order - one.order) > limits.partner_gap:
             return False
         between = T_cw[other.keyframe] @ inverse(T_cw[one.keyframe])
         error = se3_log(other.same.measured.T_ji @ between @ inverse(one.same.measured.T_ji))
         turn, shift = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
-        return bool(turn <= self._config.partner_rad and shift <= self._config.partner_m)
+        return bool(turn <= limits.partner_rad and shift <= limits.partner_m)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.camera import Camera
+from tgslam.camera import Camera, SensorNoise
 from tgslam.config.graph_settings import LoopConfig
 from tgslam.device import runtime
 from tgslam.geometry import adjoint, inverse, transform_points
@@ -26,14 +26,14 @@ from tgslam.ops import closure_icp as closure_fit
 
 Vector = NDArray[np.float64]
 
-_RANSAC_ROUNDS = 150
-_CONFIDENCE = 0.999
-_FIRST_STEPS = 3  # before it is decided anew which features agree
-_ROBUST_SIGMAS = 3.0  # beyond which a feature counts less
-_SURFACE_STEPS = 4
+_RANSAC_ROUNDS = 150  # at most: where half of the matches are right, four right ones are drawn all but surely
+_CONFIDENCE = 0.999  # that the best motion has been sampled, to stop before
+_FIRST_STEPS = 3  # before it is decided anew which features agree; the sampled motion is close already
+_ROBUST_SIGMAS = 3.0  # beyond which a feature counts less: few right ones are
+_SURFACE_STEPS = 4  # at most: matches change from step to step, so that they never settle to the last digit
 _MATCH_DISTANCE_M = 0.1  # of surfaces: those farther apart are different ones
-_INLIER_SIGMAS = 4.0  # of three coordinates
-_PLACES_ACROSS = 80  # the image: features in one of its squares are one
+_INLIER_SIGMAS = 4.0  # of three coordinates: one right match in a thousand is farther off
+_PLACES_ACROSS = 80  # the image: features in one of its squares are one, as corners found on several levels are
 
 
 @dataclass(frozen=True)
@@ -82,36 +82,36 @@ class Sameness:
 class Verification:
     """The tests of a pair, with what all pairs have in common."""
 
-    def __init__(self, camera: Camera, depth_sigma_per_m2: float, config: LoopConfig) -> None:
-        """depth_sigma_per_m2: the sensor's noise, sigma_z = this * z^2."""
-        self._camera, self._sigma, self._config = camera, depth_sigma_per_m2, config
+    def __init__(self, camera: Camera, noise: SensorNoise, config: LoopConfig) -> None:
+        self._camera, self._noise, self._config = camera, noise, config
 
     def compare(self, look_i: Look, look_j: Look) -> Sameness | None:
         """None unless the geometry speaks for one place beyond doubt."""
-        config = self._config
-        pairs = matches(look_i.features, look_j.features, config)
+        config, place, limits = self._config, self._config.expert.place, self._config.expert.acceptance
+        pairs = matches(look_i.features, look_j.features, config.expert.matching)
         if len(pairs) < config.min_inliers:
             return None
         points = self._points(look_i.features, look_j.features, pairs)
         T_ji, agree = self._sampled(points)
         if agree.sum() < config.min_inliers:
             return None
-        measured = solve(partial(self._of_points, points[agree]), T_ji, config, _FIRST_STEPS)
+        measured = solve(partial(self._of_points, points[agree]), T_ji, limits, _FIRST_STEPS)
         agree = self._squares(points, measured.T_ji) < _INLIER_SIGMAS**2
-        if agree.mean() < config.min_inlier_share or self._places(points.seen_j[agree]) < config.min_inliers:
+        if agree.mean() < place.min_inlier_share or self._places(points.seen_j[agree]) < config.min_inliers:
             return None
-        measured = solve(partial(self._of_points, points[agree]), measured.T_ji, config)
-        if measured.rank < 6 or agree.sum() < config.min_seen_again * self._in_both(look_i, look_j, measured.T_ji):
+        measured = solve(partial(self._of_points, points[agree]), measured.T_ji, limits)
+        if measured.rank < 6 or agree.sum() < place.min_seen_again * self._in_both(look_i, look_j, measured.T_ji):
             return None
-        agreeing, overlap = agreement(look_i.depth, look_j.depth, measured.T_ji, self._sigma)
-        if agreeing < config.min_depth_agreement or overlap < config.min_overlap:
+        agreeing, overlap = agreement(look_i.depth, look_j.depth, measured.T_ji, self._noise)
+        if agreeing < place.min_depth_agreement or overlap < place.min_depth_overlap:
             return None
         return Sameness(measured, self._places(points.seen_j[agree]), points[agree])
 
     def refined(self, same: Sameness, look_i: Look, look_j: Look) -> Measurement:
         """With the distances between the two depth images' surfaces, in both directions, besides the features."""
         views = _Surfaces.of(look_i.depth), _Surfaces.of(look_j.depth)
-        return solve(partial(self._of_all, same.points, *views), same.measured.T_ji, self._config, _SURFACE_STEPS)
+        limits = self._config.expert.acceptance
+        return solve(partial(self._of_all, same.points, *views), same.measured.T_ji, limits, _SURFACE_STEPS)
 
     def _of_all(self, points: Points, view_i: _Surfaces, view_j: _Surfaces, T_ji: Vector) -> Quadratic:
         """Surfaces have an error in common as features do; either view's count half."""
@@ -122,8 +122,9 @@ class Verification:
 
     def _of_surfaces(self, moving: _Surfaces, still: _Surfaces, T: Vector) -> closure_fit.SurfaceDistances:
         """In a left perturbation of the inverse of T, which takes `moving` to `still`."""
+        floor_m = self._config.expert.measuring.depth_floor_sigma_m
         return closure_fit.surface_distances(
-            moving.points, T, still.depth_m, still.camera, self._sigma, self._config.model_sigma_m, _MATCH_DISTANCE_M
+            moving.points, T, still.depth_m, still.camera, self._noise, floor_m, _MATCH_DISTANCE_M
         )
 
     def _points(self, in_i: Features, in_j: Features, pairs: NDArray[np.int64]) -> Points:
@@ -141,17 +142,16 @@ class Verification:
 
     def _variance(self, features: Features) -> Vector:
         """[N, 3] px^2, px^2, m^2."""
-        pixel = (self._config.pixel_sigma * features.scale.astype(np.float64)) ** 2
-        depth = (self._sigma * features.depth_m.astype(np.float64) ** 2) ** 2 + self._config.model_sigma_m**2
+        config = self._config.expert.measuring
+        pixel = (config.pixel_sigma * features.scale.astype(np.float64)) ** 2
+        depth = self._noise.sigma_m(features.depth_m.astype(np.float64)) ** 2 + config.depth_floor_sigma_m**2
         return np.column_stack([pixel, pixel, depth])
 
     def _sampled(self, points: Points) -> tuple[Vector, NDArray[np.bool_]]:
         """A motion [4, 4] that many points agree on, by their pixels, and which they are; RANSAC seeds itself."""
-        camera = self._camera
-        K = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
         found, rotation, shift, rows = cv2.solvePnPRansac(
-            points.in_i, points.seen_j[:, :2], K, None, iterationsCount=_RANSAC_ROUNDS,
-            reprojectionError=self._config.inlier_px, confidence=_CONFIDENCE, flags=cv2.SOLVEPNP_AP3P,
+            points.in_i, points.seen_j[:, :2], self._camera.matrix, None, iterationsCount=_RANSAC_ROUNDS,
+            reprojectionError=self._config.expert.measuring.inlier_px, confidence=_CONFIDENCE, flags=cv2.SOLVEPNP_AP3P,
         )  # fmt: skip
         T_ji, agree = np.eye(4), np.zeros(len(points.in_i), np.bool_)
         if found and rows is not None and np.isfinite(rotation).all() and np.isfinite(shift).all():
@@ -168,7 +168,7 @@ class Verification:
         by_point[:, 0, 0], by_point[:, 0, 2] = camera.fx / z, -camera.fx * p[:, 0] / z**2
         by_point[:, 1, 1], by_point[:, 1, 2] = camera.fy / z, -camera.fy * p[:, 1] / z**2
         by_point[:, 2, 2] = 1.0
-        seen = np.column_stack([camera.fx * p[:, 0] / z + camera.cx, camera.fy * p[:, 1] / z + camera.cy, p[:, 2]])
+        seen = np.column_stack([*camera.project(p), p[:, 2]])
         turned = by_point @ T_ji[:3, :3]
         covariance = turned @ points.covariance_i @ np.swapaxes(turned, 1, 2)
         covariance[:, range(3), range(3)] += points.variance_j
@@ -193,7 +193,7 @@ class Verification:
 
     def _limited(self, A: Vector, b: Vector, value: float, count: int) -> Quadratic:
         """Normal equations without the certainty that an error common to all of the residuals takes away."""
-        config = self._config
+        config = self._config.expert.measuring
         limit = np.array([config.common_sigma_rad] * 3 + [config.common_sigma_m] * 3) ** -2.0
         share = np.linalg.solve(A + np.diag(limit), np.column_stack([A, b])) * limit[:, None]
         return Quadratic(share[:, :6], share[:, 6], value, count)
@@ -201,8 +201,8 @@ class Verification:
     def _in_both(self, look_i: Look, look_j: Look, T_ji: Vector) -> int:
         """How many features of one view, the one that has more of them, are on surfaces that the other one sees."""
         from_i, from_j = look_i.features.points(self._camera), look_j.features.points(self._camera)
-        ahead, _ = compared(from_i, T_ji, look_j.depth, self._sigma)
-        back, _ = compared(from_j, inverse(T_ji), look_i.depth, self._sigma)
+        ahead, _ = compared(from_i, T_ji, look_j.depth, self._noise)
+        back, _ = compared(from_j, inverse(T_ji), look_i.depth, self._noise)
         return max(ahead, back)
 
     def _places(self, seen: Vector) -> int:

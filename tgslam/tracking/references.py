@@ -12,10 +12,10 @@ from tgslam.types import Exposure
 
 NO_PLANES: NDArray[np.float64] = np.zeros((0, 4))
 
-# Between two views that show the same alike at most, relative to the median depth: from farther away noise is larger
-_BASELINE = 0.8
-_BASELINE_AHEAD = 0.2
-_LEAST_COSINE = 0.87  # of the angle between their axes: 30 degrees
+# Between two views that show the same alike at most, relative to the median depth
+_BASELINE = 0.8  # to any side
+_BASELINE_AHEAD = 0.2  # along the axis: noise grows with the square of depth, by so much to 1.4 times
+_LEAST_COSINE = 0.87  # of the angle between their axes: 30 degrees, half of a usual field of view
 
 
 @dataclass(frozen=True)
