@@ -15,6 +15,7 @@ from tgslam.config.schema import Config
 from tgslam.errors import ConfigError
 from tgslam.geometry import inverse, orthonormalized, se3_exp, se3_log
 from tgslam.graph.closing import Correction, GraphClosing
+from tgslam.planes.instances.plane_table import PlaneTable
 from tgslam.slam import Slam
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -41,6 +42,11 @@ class Planes:
 
     def resolve(self, plane_id: int) -> int:
         return self.renamed.get(plane_id, plane_id)
+
+    @property
+    def table(self) -> PlaneTable:
+        ids = np.array([self.resolve(i) for i in range(100)], np.int32)
+        return PlaneTable(np.zeros((len(ids), 4)), ids)
 
     def seen_from(self, keyframe: int, surface_sigma_m: float | None = None) -> dict:
         if surface_sigma_m is not None:
@@ -76,7 +82,7 @@ class Walk:
         k = len(self.keyframes)
         T_cw = self.steps[k - 1].T_ji @ self.keyframes[-1].T_cw if k else self.truth[0]
         information = self.steps[k - 1].information if k else np.eye(6)
-        ids = np.full((CAMERA.height, CAMERA.width), -1, np.int16)
+        ids = np.full((CAMERA.height, CAMERA.width), -1, np.int32)
         depth_m = np.zeros(ids.shape, np.float32)
         self.keyframes.append(
             SimpleNamespace(

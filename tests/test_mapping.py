@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tests.settings import changed
 from tgslam.config.input_settings import SyntheticConfig
-from tgslam.config.map_settings import LossConfig, MappingConfig, SeedingConfig, StructureConfig
-from tgslam.config.plane_settings import PlanesConfig
+from tgslam.config.map_settings import LossConfig, MappingConfig, SeedingConfig
+from tgslam.config.plane_settings import PlanesConfig, StructureConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.device.stopwatch import Stopwatch
 from tgslam.evaluation.image_metrics import psnr
@@ -318,7 +319,7 @@ def unseen_psnr(mapper: Mapper, source: SyntheticSource) -> float:
 
 
 def test_the_final_refinement_learns_what_keyframes_show_of_planes_in_the_end(source: SyntheticSource) -> None:
-    structure, rng = StructureConfig(pgi_interval=1), np.random.default_rng(0)
+    structure, rng = changed(StructureConfig(), pgi_interval=1), np.random.default_rng(0)
     config, planes = MappingConfig(iterations=0, final_iterations=8), PlanesConfig(enabled=True)
     mapper = Mapper(source.camera, config, SeedingConfig(), LossConfig(), rng, planes, structure)
     for index in (0, 10):

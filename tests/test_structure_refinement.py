@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.settings import changed
 from tgslam.config.input_settings import SyntheticConfig
-from tgslam.config.map_settings import LossConfig, MappingConfig, SeedingConfig, StructureConfig
-from tgslam.config.plane_settings import PlanesConfig
+from tgslam.config.map_settings import LossConfig, MappingConfig, SeedingConfig
+from tgslam.config.plane_settings import StructureConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.device import runtime
 from tgslam.geometry import inverse
@@ -20,7 +21,6 @@ from tgslam.mapping.refinement import Refiner
 from tgslam.planes.identity import palette
 from tgslam.planes.identity.codes import codes_of, initial_theta, read_ids
 from tgslam.planes.instances.plane_table import PlaneTable
-from tgslam.planes.instances.registry import PlaneRegistry
 from tgslam.types import Exposure
 
 CONFIG = StructureConfig()
@@ -38,7 +38,7 @@ def true_keyframe(source: SyntheticSource, index: int, *, with_planes: bool = Tr
         source.read(index), inverse(source.pose(index)) @ source.pose(0), Exposure(), np.eye(6)
     )
     if with_planes:
-        result.plane_ids = source.labels(index).astype(np.int16)
+        result.plane_ids = source.labels(index).astype(np.int32)
     return result
 
 
@@ -61,7 +61,7 @@ def seeded(source: SyntheticSource) -> GaussianMap:
 def change_ids(view: Keyframe) -> None:
     """A plane turns out to be none."""
     assert view.plane_ids is not None
-    view.plane_ids = np.where(view.plane_ids == 0, np.int16(-1), view.plane_ids)
+    view.plane_ids = np.where(view.plane_ids == 0, np.int32(-1), view.plane_ids)
 
 
 def refined(
@@ -90,7 +90,7 @@ def share_wrong(source: SyntheticSource, gaussians: GaussianMap, refiner: Refine
 def test_without_planes_in_sight_nothing_changes_to_the_bit(source: SyntheticSource) -> None:
     plain, _ = refined(source, None, 4)
     others = [refined(source, CONFIG, 4, with_planes=False)[0]]
-    others.append(refined(source, replace(CONFIG, lambda_pgi=0.0, lambda_str=0.0), 4)[0])
+    others.append(refined(source, changed(CONFIG, lambda_pgi=0.0, lambda_str=0.0), 4)[0])
     for other in others:
         for name in PARAMETERS:
             np.testing.assert_array_equal(other.host(name), plain.host(name), err_msg=name)
@@ -99,14 +99,14 @@ def test_without_planes_in_sight_nothing_changes_to_the_bit(source: SyntheticSou
 def test_embeddings_learn_the_planes(source: SyntheticSource) -> None:
     start = share_wrong(source, *refined(source, CONFIG, 0))
     first = share_wrong(source, *refined(source, CONFIG, 1))
-    later = share_wrong(source, *refined(source, replace(CONFIG, pgi_interval=1), 12))
+    later = share_wrong(source, *refined(source, changed(CONFIG, pgi_interval=1), 12))
     assert start > 0.9
     assert first < 0.4
     assert later < 0.2
 
 
 def test_gaussians_go_to_their_planes(source: SyntheticSource) -> None:
-    off, on = (refined(source, replace(CONFIG, lambda_str=weight), 40) for weight in (0.0, 1.0))
+    off, on = (refined(source, changed(CONFIG, lambda_str=weight), 40) for weight in (0.0, 1.0))
     planes = true_planes(source).planes_w
     height = []
     for gaussians, _ in (off, on):
@@ -119,7 +119,7 @@ def test_gaussians_go_to_their_planes(source: SyntheticSource) -> None:
 
 
 def test_embeddings_take_part_in_every_nth_step_of_a_keyframe(source: SyntheticSource) -> None:
-    refiner = Refiner(source.camera, MappingConfig(), LossConfig(), structure=replace(CONFIG, pgi_interval=3))
+    refiner = Refiner(source.camera, MappingConfig(), LossConfig(), structure=changed(CONFIG, pgi_interval=3))
     terms = refiner.structure
     assert terms is not None
     first, second = (true_keyframe(source, index) for index in VIEWS)
@@ -130,7 +130,7 @@ def test_embeddings_take_part_in_every_nth_step_of_a_keyframe(source: SyntheticS
 
 
 def test_a_keyframe_with_new_ids_is_prepared_anew(source: SyntheticSource) -> None:
-    refiner = Refiner(source.camera, MappingConfig(), LossConfig(), structure=replace(CONFIG, pgi_interval=1))
+    refiner = Refiner(source.camera, MappingConfig(), LossConfig(), structure=changed(CONFIG, pgi_interval=1))
     terms, view = refiner.structure, true_keyframe(source, 0)
     assert terms is not None
     before, again = terms.due(view), terms.due(view)
@@ -140,7 +140,7 @@ def test_a_keyframe_with_new_ids_is_prepared_anew(source: SyntheticSource) -> No
 
 
 def test_a_keyframe_with_new_ids_takes_part_in_its_next_refinement(source: SyntheticSource) -> None:
-    refiner = Refiner(source.camera, MappingConfig(), LossConfig(), structure=replace(CONFIG, pgi_interval=3))
+    refiner = Refiner(source.camera, MappingConfig(), LossConfig(), structure=changed(CONFIG, pgi_interval=3))
     terms, view, other = refiner.structure, true_keyframe(source, 0), true_keyframe(source, VIEWS[1])
     assert terms is not None
     assert [terms.due(v) is not None for v in (view, other, view, other)] == [True, True, False, False]
@@ -159,16 +159,20 @@ def taken_over(source: SyntheticSource, config: StructureConfig, plane: int) -> 
     frame, labels = source.read(0), source.labels(0)
     around = replace(frame, index=1, depth_m=np.where(labels == plane, np.float32(0.0), frame.depth_m))
     blind = Keyframe.from_frame(around, np.eye(4), Exposure(), np.eye(6))
-    blind.plane_ids = np.where(labels == plane, -1, labels).astype(np.int16)
+    blind.plane_ids = np.where(labels == plane, -1, labels).astype(np.int32)
     for view in (true_keyframe(source, 0), blind, blind):
         refiner.step(gaussians, view, move_pose=False)
     colours = 1.0 / (1.0 + np.exp(-gaussians.host("embedding")[gaussians.host("plane_id") == plane]))
-    return float(np.mean(palette.ids_of(colours, np.unique(labels[labels >= 0]), CONFIG.read_margin) != plane))
+    return float(
+        np.mean(palette.ids_of(colours, np.unique(labels[labels >= 0]), CONFIG.expert.reading.read_margin) != plane)
+    )
 
 
 def test_a_view_that_shows_only_the_fringe_of_a_plane_takes_less_of_it_over(source: SyntheticSource) -> None:
-    config = replace(CONFIG, pgi_interval=1)
-    damped, undamped = (taken_over(source, replace(config, fringe_share=s), 1) for s in (config.fringe_share, 0.0))
+    config = changed(CONFIG, pgi_interval=1)
+    damped, undamped = (
+        taken_over(source, changed(config, fringe_share=s), 1) for s in (config.expert.embedding.fringe_share, 0.0)
+    )
     assert undamped > 0.15
     assert damped < 0.7 * undamped
 
@@ -192,7 +196,7 @@ def test_absorbed_planes_look_like_their_survivors_and_removed_ones_like_none(so
     np.testing.assert_array_equal(codes[2], codes_of(1, CONFIG))
 
 
-def test_the_table_of_a_registry_without_planes_is_empty_of_them() -> None:
-    table = PlaneTable.of(PlaneRegistry(PlanesConfig(), 0.0015), 3)
+def test_the_table_of_planes_that_were_all_removed_is_empty_of_them() -> None:
+    table = PlaneTable.of({}, np.full(3, -1, np.int32))
     np.testing.assert_array_equal(table.ids, [-1, -1, -1])
     assert not table.planes_w.any()

@@ -1,4 +1,4 @@
-"""Settings of the map: how it is seeded, refined, and held to planes, and under which objective."""
+"""Settings of the map: how it is seeded and refined, and under which objective."""
 
 from __future__ import annotations
 
@@ -91,35 +91,3 @@ class LossConfig:
     def noise(self) -> SensorNoise:
         """The sensor's."""
         return SensorNoise(self.depth_sigma_per_m2)
-
-
-@dataclass(frozen=True)
-class StructureConfig:
-    """What planes ask of the map: the instance field (Eqs. 1-4) and the regularisers (Eqs. 8, 9), as of Eq. 14."""
-
-    lambda_pgi: float = setting(0.03, 0.0, 100.0, doc="what E_pgi weighs for geometry; 0 = no instance field")
-    identity: str = setting("colour", choices=("colour", "scalar"), doc="what a Gaussian carries of its plane's id")
-    scalar_ids: int = setting(64, 1, 100_000, doc="with identity: scalar, ids that can be told apart")
-    pgi_interval: int = setting(3, 1, 1000, doc="refinements of a keyframe, from one that sees its planes to the next")
-    charbonnier_pgi: float = setting(0.1, 1e-6, 1.0, doc="epsilon of Eq. 4, colour in [0, 1]")
-    edge_boost: float = setting(2.0, 0.0, 100.0, doc="pixels at a boundary weigh 1 + this")
-    weight_none: float = setting(0.5, 0.0, 1.0, doc="weight of measured pixels that are on no plane")
-    relaxation: float = setting(1.0, 0.0, 1.9, doc="of embeddings; 1 = the full step")
-    fringe_share: float = setting(
-        2.0, 0.0, 100.0, doc="of its best view: one that shows less of a Gaussian moves it less"
-    )
-    read_margin: float = setting(0.05, 0.0, 1.0, doc="ids are read where no other code is less than this farther")
-    read_opacity: float = setting(0.5, 0.01, 1.0, doc="and rendered opacity is at least this")
-    read_distance_m: float = setting(0.05, 0.0, 10.0, doc="and the rendered surface is at most this far from the plane")
-    read_sigmas: float = setting(
-        3.0, 0.0, 100.0, doc="and so many standard deviations of the sensor's depth, and adjoins"
-    )
-    read_margin_m: float = setting(
-        0.05, 0.001, 10.0, doc="what lies no farther than this beyond where the plane was seen"
-    )
-    lambda_str: float = setting(0.08, 0.0, 100.0, doc="what E_str weighs; 0 = no regularisers")
-    omega_flat: float = setting(1.0, 0.0, 100.0, doc="of Eq. 8, scales relative to sqrt(s1 s2)")
-    omega_normal: float = setting(0.3, 0.0, 100.0, doc="of Eq. 9")
-    omega_distance: float = setting(0.4, 0.0, 100.0, doc="of the distance to the plane")
-    thinness: float = setting(0.1, 0.0, 1.0, doc="k of Eq. 8")
-    sigma_distance_m: float = setting(0.03, 1e-5, 1.0, doc="farther off, a Gaussian is left where it is")

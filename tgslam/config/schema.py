@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from tgslam.config.graph_settings import ClosureConfig, LoopConfig
 from tgslam.config.input_settings import DatasetConfig, EvaluationConfig, SyntheticConfig
-from tgslam.config.map_settings import LossConfig, MappingConfig, SeedingConfig, StructureConfig
-from tgslam.config.plane_settings import PlanesConfig
+from tgslam.config.map_settings import LossConfig, MappingConfig, SeedingConfig
+from tgslam.config.plane_settings import PlanesConfig, StructureConfig
 from tgslam.config.setting import setting
 from tgslam.config.tracking_settings import KeyframeConfig, TrackingConfig
 

@@ -17,7 +17,6 @@ from tgslam.graph.structure.search import Closure, ClosureSearch
 from tgslam.graph.visual.loop_search import LoopSearch
 from tgslam.map.keyframe import Keyframe
 from tgslam.planes.estimate import PlaneEstimate
-from tgslam.planes.instances.instance import NO_ID
 from tgslam.planes.instances.registry import PlaneRegistry
 from tgslam.types import Matrix4, RelativePose
 
@@ -117,7 +116,9 @@ class GraphClosing:
         sightings: dict[int, Mapping[int, PlaneEstimate]] = {k: planes.seen_from(k, surface_m) for k in seen}
 
         def view(keyframe: int) -> View:
-            return View(keyframes[keyframe].depth_m(), _resolved(keyframes[keyframe].plane_ids, planes))
+            plane_ids = keyframes[keyframe].plane_ids
+            assert plane_ids is not None  # closures are looked for only where planes are
+            return View(keyframes[keyframe].depth_m(), planes.table.resolved(plane_ids))
 
         return self._search.find(sightings, dict(enumerate(T_cw)), self._graph.relative, view).closures
 
@@ -138,11 +139,3 @@ class GraphClosing:
             return {}
         self._applied = [T.copy() for T in T_cw]
         return dict(enumerate(motions))
-
-
-def _resolved(plane_ids: NDArray[np.int16] | None, planes: PlaneRegistry) -> NDArray[np.int32]:
-    """[H, W] of a keyframe, under the ids that PGIs have by now."""
-    assert plane_ids is not None  # closures are looked for only where planes are
-    known, place = np.unique(plane_ids, return_inverse=True)
-    now = np.array([planes.resolve(int(i)) if i >= 0 else NO_ID for i in known], np.int32)
-    return now[place].reshape(plane_ids.shape)

@@ -25,7 +25,7 @@ class Keyframe:
     _colour: NDArray[np.uint8]
     _depth: NDArray[np.uint16]
     seen: dict[int, float] = field(default_factory=dict)  # shares of the map in view by keyframe it was born with
-    plane_ids: NDArray[np.int16] | None = None  # [H, W] PGI of each pixel, -1 = none; None = planes are not looked for
+    plane_ids: NDArray[np.int32] | None = None  # [H, W] PGI of each pixel, -1 = none; None = planes are not looked for
 
     @classmethod
     def from_frame(

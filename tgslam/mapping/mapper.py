@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.map_settings import LossConfig, MappingConfig, SeedingConfig, StructureConfig
-from tgslam.config.plane_settings import PlanesConfig
+from tgslam.config.map_settings import LossConfig, MappingConfig, SeedingConfig
+from tgslam.config.plane_settings import PlanesConfig, StructureConfig
 from tgslam.device import runtime
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, orthonormalized, transform_points
 from tgslam.map.gaussians import GaussianMap

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.camera import Camera
+from tgslam.camera import Camera, SensorNoise
 from tgslam.config.plane_settings import PlanesConfig
 from tgslam.device import runtime
 from tgslam.geometry import inverse
@@ -68,8 +68,10 @@ class PlanarMapping:
     def __init__(self, camera: Camera, config: PlanesConfig, sigma_per_m2: float) -> None:
         """sigma_per_m2: the sensor's noise, sigma_z = this * z^2."""
         self.camera, self.config, self.sigma_per_m2 = camera, config, sigma_per_m2
-        self.registry = PlaneRegistry(config, sigma_per_m2)
-        self._T_cw: list[NDArray[np.float64]] = []  # of each keyframe, as the PGIs know it
+        self.noise = SensorNoise(sigma_per_m2)
+        self._T_wc: dict[int, NDArray[np.float64]] = {}  # of each keyframe, as the PGIs know it
+        self.registry = PlaneRegistry(config, self.noise, self._T_wc)
+        self._T_cw: list[NDArray[np.float64]] = []  # likewise
         self._rays = camera.rays()
 
     @property
@@ -85,8 +87,9 @@ class PlanarMapping:
         self.follow(keyframes)
         keyframe, number = keyframes[-1], len(keyframes) - 1
         self._T_cw.append(keyframe.T_cw.copy())
+        self._T_wc[number] = inverse(keyframe.T_cw)
         depth_m = keyframe.depth_m()
-        view = extract_planes(runtime.to_device(depth_m), self.camera, self.config, self.sigma_per_m2)
+        view = extract_planes(runtime.to_device(depth_m), self.camera, self.config, self.noise)
         view = self.registry.with_known_steps(view, depth_m, self.camera, keyframe.T_cw)
         observation = self.registry.observe(view, depth_m, self.camera, keyframe.T_cw, number)
         for earlier in keyframes[:-1]:
@@ -97,12 +100,12 @@ class PlanarMapping:
         pixels = self._pixels(ids, depth_m, keyframe.T_cw)
         # Surfaces that wait for other views are no part of those that they may lie close to: they are named later
         waiting = (view.labels >= 0) & (seen == NO_ID)
-        keyframe.plane_ids = np.where(waiting, NO_ID, pixels.ids).astype(np.int16)
+        keyframe.plane_ids = np.where(waiting, NO_ID, pixels.ids).astype(np.int32)
         return pixels
 
     def table(self) -> PlaneTable:
         """The planes as they are now, by every id that was ever given."""
-        return PlaneTable.of(self.registry, self.registry.id_count)
+        return self.registry.table
 
     def seen_from(self, number: int) -> list[PlanarInstance]:
         """The PGIs that a keyframe saw."""
@@ -140,7 +143,7 @@ class PlanarMapping:
         """
         seen = Projection(gaussians, self.camera, T_cw)
         rows, ids = np.flatnonzero(seen.inside), pixels.ids[seen.v, seen.u]
-        plane_ids = np.append(self.table().ids, np.int32(NO_ID))[gaussians.host("plane_id")]  # -1 takes the last one
+        plane_ids = self.table().resolved(gaussians.host("plane_id"))
         means = gaussians.host("mean")
         for plane_id, instance in self.instances.items():
             named = rows[ids == plane_id]
@@ -155,9 +158,10 @@ class PlanarMapping:
             T_cw = keyframes[number].T_cw
             if not np.array_equal(T_cw, known):
                 corrections[number] = inverse(T_cw) @ known
+                self._T_wc[number] = corrections[number] @ self._T_wc[number]
                 self._T_cw[number] = T_cw.copy()
         if corrections:
-            self.registry.moved(corrections)
+            self.registry.follow(corrections)
 
     def complete(self, keyframes: Sequence[Keyframe]) -> None:
         """Keyframes show PGIs that were confirmed, or seen in full, only after them."""
@@ -186,7 +190,7 @@ class PlanarMapping:
             completed = extents.completed(ids[part])
             if np.array_equal(completed, ids[part]):
                 return
-        keyframe.plane_ids = completed.astype(np.int16)
+        keyframe.plane_ids = completed.astype(np.int32)
 
     def _completed(
         self, ids: NDArray[np.int32], depth_m: NDArray[np.float32], T_cw: NDArray[np.float64]
@@ -221,7 +225,7 @@ class PlanarMapping:
             offset_m = instance.offset_m - normal @ T_cw[:3, 3]
             z = -offset_m / np.minimum(self._rays.reshape(-1, 3)[at] @ normal, -1e-6)
             sigma_m = self.sigma_per_m2 * z**2
-            agrees = np.abs(z - measured) < _AGREEMENT * (sigma_m + self.config.model_sigma_m)
+            agrees = np.abs(z - measured) < _AGREEMENT * (sigma_m + self.config.expert.uncertainty.planarity_sigma_m)
             agrees |= measured <= 0
             on = at[agrees]
             depth_m.ravel()[on], kept.ravel()[on] = z[agrees], plane_id
@@ -248,7 +252,7 @@ def _show(keyframe: Keyframe, ids: NDArray[np.int32]) -> None:
     """Tell a keyframe its PGIs [H, W]. Its array stays if nothing is new, and with it what was prepared from that."""
     assert keyframe.plane_ids is not None
     if not np.array_equal(ids, keyframe.plane_ids):
-        keyframe.plane_ids = ids.astype(np.int16)
+        keyframe.plane_ids = ids.astype(np.int32)
 
 
 def _named(ids: NDArray[np.int32]) -> NDArray[np.intp]:

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.map_settings import LossConfig, MappingConfig, StructureConfig
+from tgslam.config.map_settings import LossConfig, MappingConfig
+from tgslam.config.plane_settings import StructureConfig
 from tgslam.device import runtime
 from tgslam.device.stopwatch import Stopwatch, stage
 from tgslam.geometry import orthonormalized, se3_exp

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.config.map_settings import StructureConfig
+from tgslam.config.plane_settings import StructureConfig
 from tgslam.device import runtime
 from tgslam.map.gaussians import GaussianMap
 from tgslam.map.keyframe import Keyframe
@@ -31,8 +31,8 @@ class StructureTerms:
         self._kept_targets = kept_targets
         self._workspace = instance_field.Workspace(camera.height, camera.width)
         self._regularisers = PlaneRegularisers(config)
-        self._targets: OrderedDict[int, tuple[NDArray[np.int16], InstanceTarget]] = OrderedDict()
-        self._visits: dict[int, tuple[NDArray[np.int16], int]] = {}  # by keyframe, since it has had these ids
+        self._targets: OrderedDict[int, tuple[NDArray[np.int32], InstanceTarget]] = OrderedDict()
+        self._visits: dict[int, tuple[NDArray[np.int32], int]] = {}  # by keyframe, since it has had these ids
         self.set_planes(PlaneTable.empty())
 
     def set_planes(self, table: PlaneTable) -> None:
@@ -54,7 +54,11 @@ class StructureTerms:
         ids, visit = self._visits.get(keyframe.index, (keyframe.plane_ids, 0))
         visit = visit if ids is keyframe.plane_ids else 0
         self._visits[keyframe.index] = keyframe.plane_ids, visit + 1
-        return self._target(keyframe, keyframe.plane_ids) if visit % self.config.pgi_interval == 0 else None
+        return (
+            self._target(keyframe, keyframe.plane_ids)
+            if visit % self.config.expert.embedding.pgi_interval == 0
+            else None
+        )
 
     def pgi(self, rendered: RenderImages, target: InstanceTarget, g_opacity: np.ndarray) -> InstanceGradient:
         """E_pgi at a rendering; its derivative by opacity is added to g_opacity [H, W]."""
@@ -86,11 +90,11 @@ class StructureTerms:
         """Means of E_str's terms in the last step that had it: flat, normal, distance; count of Gaussians."""
         return self._regularisers.parts
 
-    def _target(self, keyframe: Keyframe, plane_ids: NDArray[np.int16]) -> InstanceTarget:
+    def _target(self, keyframe: Keyframe, plane_ids: NDArray[np.int32]) -> InstanceTarget:
         known = self._targets.pop(keyframe.index, None)
         if known is None or known[0] is not plane_ids:
             depth_m = runtime.to_device(keyframe.depth_m())
-            known = plane_ids, instance_field.prepare(plane_ids, depth_m, self.config)
+            known = plane_ids, instance_field.prepare(plane_ids, depth_m, self.config.expert.embedding)
         self._targets[keyframe.index] = known
         while len(self._targets) > self._kept_targets:
             self._targets.popitem(last=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tgslam.config.map_settings import StructureConfig
+from tgslam.config.plane_settings import StructureConfig
 from tgslam.device import runtime
 from tgslam.device.arrays import require
 from tgslam.kernels import plane_regularisers as kernels
@@ -47,7 +47,7 @@ class PlaneRegularisers:
             gaussians.mean, gaussians.log_scale, gaussians.quat_wxyz,
             config.lambda_str * config.omega_flat, config.lambda_str * config.omega_normal,
             config.lambda_str * config.omega_distance,
-            config.thinness, config.sigma_distance_m, self._counted,
+            config.expert.shape.thinness, config.expert.shape.sigma_distance_m, self._counted,
             into.mean, into.log_scale, into.quat_wxyz, self._partial,
         )  # fmt: skip
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from tests.cuda.harness import scenario
+from tests.settings import changed
 from tgslam.camera import Camera
 from tgslam.config.input_settings import SyntheticConfig
-from tgslam.config.map_settings import LossConfig, MappingConfig, StructureConfig
+from tgslam.config.map_settings import LossConfig, MappingConfig
+from tgslam.config.plane_settings import StructureConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.geometry import se3_exp
 from tgslam.map.gaussians import PARAMETERS, GaussianMap
@@ -52,7 +54,7 @@ def _see_planes(source: SyntheticSource, keyframe: Keyframe, gaussians: Gaussian
     local = np.column_stack([planes_w[:, :3] @ T_wc[:3, :3], offsets])
     terms.set_planes(PlaneTable(local, np.arange(len(local), dtype=np.int32)))
     labels = source.labels(0)
-    keyframe.plane_ids = labels.astype(np.int16)
+    keyframe.plane_ids = labels.astype(np.int32)
     mean = gaussians.host("mean")
     u = np.rint(camera.fx * mean[:, 0] / mean[:, 2] + camera.cx).astype(int)
     v = np.rint(camera.fy * mean[:, 1] / mean[:, 2] + camera.cy).astype(int)
@@ -68,7 +70,7 @@ def steps(optimizer: str = "relaxation", steps: int = 3, planes: bool = False) -
     source = SyntheticSource(SyntheticConfig(scene="room", width=64, height=48, frames=720), seed=0)
     frame = source.read(0)
     gaussians = GaussianMap.from_gaussians(_facing(frame, source.camera))
-    structure = StructureConfig(pgi_interval=2) if planes else None
+    structure = changed(StructureConfig(), pgi_interval=2) if planes else None
     refiner = Refiner(source.camera, MappingConfig(optimizer=optimizer), LossConfig(), structure=structure)
     refiner.append(gaussians.count)
     pose = se3_exp([0.002, -0.001, 0.001, 0.003, 0.002, -0.004])
