@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests.reference import instance_field as reference
+from tests.reference.palette import ids_of
 from tests.settings import changed
 from tests.test_loss_kernels import assert_gradient, central
 from tgslam.bench.ablation import identity_study as identity
@@ -158,7 +159,7 @@ def test_views_of_a_fringe_do_not_overwrite_what_a_good_view_has_told(fringe_sha
     config = changed(CONFIG, fringe_share=fringe_share)
 
     def shown(theta):
-        return palette.ids_of(1 / (1 + np.exp(-theta[None])), np.arange(8), CONFIG.expert.reading.read_margin)[0]
+        return ids_of(1 / (1 + np.exp(-theta[None])), np.arange(8), CONFIG.expert.reading.read_margin)[0]
 
     theta = instance_field.theta_of(codes_of([3], config))[0].astype(float)
     for _ in range(10):
@@ -193,7 +194,7 @@ def test_ids_are_read_as_by_the_twin(margin, known):
     assert (found != expected).mean() < 1e-3  # rounding, where two codes are as far
     assert (found >= 0).any() == (known > 0)
     if known:
-        rows = palette.ids_of((embedding / opacity[..., None])[opacity >= 0.5], np.arange(known), margin)
+        rows = ids_of((embedding / opacity[..., None])[opacity >= 0.5], np.arange(known), margin)
         assert (found[opacity >= 0.5] != rows).mean() < 1e-3
 
 

@@ -89,7 +89,7 @@ def test_a_strip_that_no_cell_tells_from_the_wall_is_found_along_it_and_kept(see
     graph = planar_cells(runtime.to_device(depth_m), grid, NOISE.per_m2, LIMITS.cell_share, LIMITS.cell_sigmas)
     board = labels.reshape(60, 4, 80, 4).mean(axis=(1, 3)).ravel()[graph.cell]
     agreement = Agreement(NOISE.per_m2, LIMITS.join_sigmas, 0.0, LIMITS.join_shift_m)
-    group, parent = part_layers(graph, grid.shape, np.zeros(len(board), np.intp), agreement, least_px=230.0)
+    group, parent = part_layers(graph, grid.shape, np.zeros(len(board), np.intp), agreement, 230.0, CONFIG.expert.steps)
     strip = np.isin(group, np.flatnonzero(parent == 0))
     assert np.mean(board[strip] > 0.1) > 0.6
     assert np.mean(strip[board > 0.9]) > 0.4

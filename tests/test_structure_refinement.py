@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.reference.palette import ids_of
 from tests.settings import changed
 from tgslam.config.input_settings import SyntheticConfig
 from tgslam.config.map_settings import LossConfig, MappingConfig, SeedingConfig
@@ -18,7 +19,6 @@ from tgslam.map.gaussians import PARAMETERS, GaussianMap
 from tgslam.map.keyframe import Keyframe
 from tgslam.mapping.insertion import quadtree, seed
 from tgslam.mapping.refinement import Refiner
-from tgslam.planes.identity import palette
 from tgslam.planes.identity.codes import codes_of, initial_theta, read_ids
 from tgslam.planes.instances.plane_table import PlaneTable
 from tgslam.types import Exposure
@@ -163,9 +163,7 @@ def taken_over(source: SyntheticSource, config: StructureConfig, plane: int) -> 
     for view in (true_keyframe(source, 0), blind, blind):
         refiner.step(gaussians, view, move_pose=False)
     colours = 1.0 / (1.0 + np.exp(-gaussians.host("embedding")[gaussians.host("plane_id") == plane]))
-    return float(
-        np.mean(palette.ids_of(colours, np.unique(labels[labels >= 0]), CONFIG.expert.reading.read_margin) != plane)
-    )
+    return float(np.mean(ids_of(colours, np.unique(labels[labels >= 0]), CONFIG.expert.reading.read_margin) != plane))
 
 
 def test_a_view_that_shows_only_the_fringe_of_a_plane_takes_less_of_it_over(source: SyntheticSource) -> None:

@@ -53,6 +53,28 @@ class SegmentationSettings:
 
 
 @dataclass(frozen=True)
+class StepSettings:
+    """When a part of a surface stands off it, as skirting boards and panels do. Sigmas are of mean misfits."""
+
+    step_sigmas: float = setting(
+        2.5, 0.1, 100.0, doc="Misfit of squares of cells, in sigmas, beyond which a part stands off its surface."
+    )
+    strip_sure_sigmas: float = setting(
+        4.5, 0.1, 100.0, doc="Misfit along a line, in sigmas, that a strip has at one place at least."
+    )
+    strip_likely_sigmas: float = setting(2.0, 0.1, 100.0, doc="Misfit along a line, in sigmas, of all of a strip.")
+    known_step_sigmas: float = setting(
+        1.3, 0.1, 100.0, doc="Half a step that other views have told, in sigmas of a square of pixels, at least."
+    )
+    known_step_share: float = setting(
+        0.35, 0.0, 1.0, doc="Share of a known extent that a view shows off its surface: noise puts little of it there."
+    )
+    known_step_odds: float = setting(
+        3.0, 0.0, 100.0, doc="Logarithm of the odds, by other views, of such a surface over its extent and beside it."
+    )
+
+
+@dataclass(frozen=True)
 class ReliabilitySettings:
     """When a segment counts by itself; other views have to confirm all others."""
 
@@ -85,6 +107,12 @@ class AssociationSettings:
     )
     min_mask_overlap: float = setting(
         0.25, 0.0, 1.0, doc="Intersection of the masks of segment and PGI over the smaller one, at least."
+    )
+    careful_iou: float = setting(
+        0.15, 0.0, 1.0, doc="IoU (Eq. 6) of masks that are matched one to one, at least; less is for pieces."
+    )
+    lenient_iou: float = setting(
+        0.5, 0.0, 1.0, doc="The same in the second round, for a pose that has jumped farther than expected."
     )
     mask_width_px: int = setting(96, 16, 4096, doc="Width of the masks of Eq. 6 at most, in pixels.")
 
@@ -159,6 +187,7 @@ class PlanesExpert:
     """What needs knowledge of the algorithm to be turned."""
 
     segmentation: SegmentationSettings = field(default_factory=SegmentationSettings)
+    steps: StepSettings = field(default_factory=StepSettings)
     reliability: ReliabilitySettings = field(default_factory=ReliabilitySettings)
     association: AssociationSettings = field(default_factory=AssociationSettings)
     gaps: GapSettings = field(default_factory=GapSettings)

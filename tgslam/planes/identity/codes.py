@@ -9,8 +9,7 @@ from tgslam.config.plane_settings import StructureConfig
 from tgslam.ops import instance_field
 from tgslam.planes.identity import palette
 
-_LEAST, _MOST = 0.04, 0.96  # what a sigmoid (Eq. 1) reaches without saturating
-_NEAR_MARGINS = 2.0  # of reading: so near has to be a mixture
+_NEAR_MARGINS = 2.0  # of reading: so near has to be a mixture, each end of which may be off by one
 _NEUTRAL = 0.5  # what embeddings of 0 show: channels that carry nothing never move
 
 
@@ -24,7 +23,7 @@ def codes_of(ids: ArrayLike, config: StructureConfig) -> NDArray[np.float32]:
     if config.identity == "colour":
         return palette.colours(ids)
     steps = np.clip((np.asarray(ids, np.float64) + 1.0) / config.expert.embedding.scalar_ids, 0.0, 1.0)
-    first = _LEAST + (_MOST - _LEAST) * steps
+    first = palette.LEAST + (palette.MOST - palette.LEAST) * steps
     return np.stack([first, np.full_like(first, _NEUTRAL), np.full_like(first, _NEUTRAL)], axis=-1).astype(np.float32)
 
 
@@ -71,4 +70,4 @@ def unmixed(colours: NDArray[np.floating], ids: NDArray[np.integer], config: Str
 def _margin(config: StructureConfig) -> float:
     if config.identity == "colour":
         return config.expert.reading.read_margin
-    return config.expert.reading.read_margin * (_MOST - _LEAST) / config.expert.embedding.scalar_ids
+    return config.expert.reading.read_margin * (palette.MOST - palette.LEAST) / config.expert.embedding.scalar_ids

@@ -18,7 +18,7 @@ from tgslam.planes.identity.outline import Outline
 from tgslam.planes.instances.instance import NO_ID
 from tgslam.types import FloatImage, Matrix4, Plane
 
-_AROUND = tuple((dy, dx) for dy in (-2, 0, 2) for dx in (-2, 0, 2) if dy or dx)  # px
+_AROUND = tuple((dy, dx) for dy in (-2, 0, 2) for dx in (-2, 0, 2) if dy or dx)  # px: beyond a blurred edge
 
 
 class PlaneReader:

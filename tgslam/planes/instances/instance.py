@@ -15,7 +15,7 @@ from tgslam.planes.instances.support import Support
 from tgslam.planes.instances.track_record import TrackRecord
 from tgslam.planes.instances.views import Poses, Vector, Views
 
-NO_ID = -1
+NO_ID = palette.NO_PLANE
 
 
 class PlanarInstance:

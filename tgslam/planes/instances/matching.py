@@ -19,11 +19,9 @@ from tgslam.planes.instances.view_planes import ViewPlanes
 
 Vector = NDArray[np.float64]
 
-_LEAST_COMMON = 4  # samples of two masks
+_LEAST_COMMON = 4  # samples of two masks that overlap: fewer may be the noise of their borders
 LEAST_SAMPLES = 12  # of a plane's extent in view, for the view to say something against it
 WELL = 0.5  # of the gate: planes agree well
-_CAREFUL_IOU = 0.15  # of masks that are matched one to one; less is for pieces, which `continued` is for
-_LENIENT_IOU = 0.5  # likewise without care
 _MAIN_SHARE = 0.5  # of what a segment has in common with any instance that it fits, that it has with its own
 _MOST = 0.5  # of a segment that lies on the extent of what it is no new part of
 _SHARED_VIEWS = 5  # latest ones in which two instances are compared
@@ -74,7 +72,8 @@ class ViewMatching:
         masks = self._overlap(seen)
         agreement = (self._careful if careful else self._lenient)[np.ix_(free, seen)]
         allowed = agreement.admitted & self._meet(masks)[free]
-        allowed &= masks.iou[free] >= (_CAREFUL_IOU if careful else _LENIENT_IOU)
+        limits = self.config.expert.association
+        allowed &= masks.iou[free] >= (limits.careful_iou if careful else limits.lenient_iou)
         # A piece of one surface is no other surface that happens to have a part of its extent
         common = np.where(agreement.admitted, masks.intersection[free], 0)
         allowed &= common >= _MAIN_SHARE * common.max(axis=1, keepdims=True)

@@ -13,15 +13,15 @@ from tgslam.ops.plane_fit import CellGrid, Floats, Indices, Labels
 from tgslam.planes.segmentation.merging import Agreement
 from tgslam.planes.segmentation.moments import Joints, planes_of
 
-_SIGMAS = 3.0  # beyond which a measurement lies before or behind a plane
+_SIGMAS = 3.0  # of a pixel's noise, beyond which a measurement lies before or behind a plane
 _OPEN_SHARE = 0.2  # of the ways between two pieces, that may be open: their borders need not be parallel
 _CLOSED_SHARE = 0.5  # of the ways that have to be known to be closed; without measurements nothing is known
 _SEEN_SHARE = 0.5  # of a way that is measured when it is known
 _PARTED_SHARE = 0.5  # of the ways, on which something close before the plane may part it
 _REACH = 2.5  # a gap may be so many times as wide as the larger piece is (root of its area)
-_LINKS = 48
+_LINKS = 48  # ways at most that are looked along, from all along a gap
 _SAMPLES = 16  # along each link, or more where it is longer, in steps of at most a pixel
-_MOST_SAMPLES = 64
+_MOST_SAMPLES = 64  # along a link, which bounds the time that a gap takes
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,7 @@ def _pieces(depth_m: np.ndarray, grid: CellGrid, config: PlanesConfig, sigma: fl
     image_px = grid.camera.width * grid.camera.height
     least_px = limits.piece_share * config.min_area_share * image_px
     group = np.where(moments[group, 0] >= least_px, group, -1)
-    group, parent = part_layers(graph, grid.shape, group, lenient, _LAYER_PIECES * least_px)
+    group, parent = part_layers(graph, grid.shape, group, lenient, _LAYER_PIECES * least_px, config.expert.steps)
     group = settle(graph, grid.shape, group, _LARGE_SHARE * image_px, parent)
     pieces = _numbered(graph, group, grid, least_px)
     return bridge(pieces, runtime.to_host(depth_m), grid, agreement, config.expert.gaps), lenient
