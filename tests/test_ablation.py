@@ -35,7 +35,7 @@ import dataclasses, sys, time
 from pathlib import Path
 from tgslam.config.loader import load
 from tgslam.output.run_folder import RunFolder, RunRecord, RunState
-from tgslam.types import Camera
+from tgslam.camera import Camera
 assert sys.argv[1] == "run" and "--overwrite" in sys.argv
 config, output = load(Path(sys.argv[2])), Path(sys.argv[sys.argv.index("--output") + 1])
 if config.seed == 15:

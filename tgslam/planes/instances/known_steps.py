@@ -102,7 +102,7 @@ class _Place:
         return bool(np.count_nonzero(self._gain(step_m) > 0) >= config.known_step_share * np.count_nonzero(self.over))
 
     def nearer(self, step_m: float, odds: float) -> Mask:
-        """[N] the pixels that more likely show a plane at such a step than the segment's. odds: logarithm, by others."""
+        """[N] the pixels that more likely show a plane at such a step than the segment's. odds: by others."""
         return self._gain(step_m) > np.where(self.over, -odds, odds)
 
     def _gain(self, step_m: float) -> Vector:
