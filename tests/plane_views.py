@@ -212,7 +212,7 @@ class Rectangle:
 def cast(rectangles: list[Rectangle], camera: Camera, T_cw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Exact depth [H, W] m and the index of the rectangle seen at each pixel, -1 = none."""
     T_wc = inverse(T_cw)
-    rays = points_c(camera, np.ones((camera.height, camera.width))) @ T_wc[:3, :3].T
+    rays = points_c(camera, np.ones(camera.shape)) @ T_wc[:3, :3].T
     depth, labels = np.full(rays.shape[:2], np.inf), np.full(rays.shape[:2], -1)
     for i, rectangle in enumerate(rectangles):
         plane = rectangle.plane

@@ -82,7 +82,7 @@ class Walk:
         k = len(self.keyframes)
         T_cw = self.steps[k - 1].T_ji @ self.keyframes[-1].T_cw if k else self.truth[0]
         information = self.steps[k - 1].information if k else np.eye(6)
-        ids = np.full((CAMERA.height, CAMERA.width), -1, np.int32)
+        ids = np.full(CAMERA.shape, -1, np.int32)
         depth_m = np.zeros(ids.shape, np.float32)
         self.keyframes.append(
             SimpleNamespace(

@@ -26,14 +26,9 @@ LIMITS = CONFIG.expert.segmentation
 WALL = (0.0, 0.0, -1.0)
 
 
-def rays(camera: Camera = CAMERA) -> np.ndarray:
-    v, u = np.mgrid[: camera.height, : camera.width]
-    return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
-
-
 def plane_depth(normal, offset_m: float, camera: Camera = CAMERA) -> np.ndarray:
     """[H, W] depth of n . x + d = 0; infinite where a ray does not meet it."""
-    along = -rays(camera) @ (np.asarray(normal) / np.linalg.norm(normal))
+    along = -camera.rays() @ (np.asarray(normal) / np.linalg.norm(normal))
     return np.where(along > 1e-6, offset_m / np.maximum(along, 1e-6), np.inf)
 
 
@@ -154,7 +149,7 @@ def tables() -> tuple[np.ndarray, np.ndarray]:
     """Two table tops at one height, 0.2 m apart, over a floor; and a mask of the tops."""
     up = np.array([0.0, -1.0, -1.0]) / np.sqrt(2)
     top, floor = plane_depth(up, 1.2), plane_depth(up, 1.9)
-    across = rays()[..., 0] * top
+    across = CAMERA.rays()[..., 0] * top
     on_top = (abs(across) > 0.1) & (abs(across) < 0.9) & (np.arange(240)[:, None] > 40)
     return np.where(on_top, top, floor), on_top
 
@@ -246,7 +241,7 @@ def test_a_wall_that_a_board_hides_a_part_of_is_one():
 @pytest.mark.parametrize("radius_m", [0.15, 0.4, 0.8, 1.5])
 def test_a_cylinder_is_no_plane(radius_m):
     """Its axis is upright, and its front 1.2 m from the camera."""
-    r = rays()
+    r = CAMERA.rays()
     a, b, c = r[..., 0] ** 2 + 1.0, -(1.2 + radius_m), (1.2 + radius_m) ** 2 - radius_m**2
     inside = b * b - a * c
     exact_m = np.where(inside > 0, (-b - np.sqrt(np.maximum(inside, 0.0))) / a, 0.0)
@@ -254,7 +249,7 @@ def test_a_cylinder_is_no_plane(radius_m):
 
 
 def test_a_sphere_is_no_plane():
-    r = rays()
+    r = CAMERA.rays()
     a, b, c = (r**2).sum(axis=-1), -1.7, 1.7**2 - 0.5**2
     inside = b * b - a * c
     exact_m = np.where(inside > 0, (-b - np.sqrt(np.maximum(inside, 0.0))) / a, 0.0)

@@ -149,7 +149,7 @@ def settled(depth_m: np.ndarray, small_rows: slice) -> np.ndarray:
 
 def behind_a_post(board: tuple[slice, slice], step_m: float, seed: int) -> np.ndarray:
     """Depth of a wall, four times as noisy as the sensor should be, with a board on it; none where the post stands."""
-    depth_m = np.full((CAMERA.height, CAMERA.width), 2.0)
+    depth_m = np.full(CAMERA.shape, 2.0)
     depth_m[board] -= step_m
     depth_m += 4.0 * NOISE.per_m2 * np.random.default_rng(seed).standard_normal(depth_m.shape)
     depth_m[:, 260:272] = 0.0
@@ -280,7 +280,7 @@ def test_a_surface_that_waits_for_other_views_is_no_part_of_the_floor_that_it_st
 
 def test_keyframes_show_in_the_end_what_only_later_ones_have_seen_of_a_plane() -> None:
     mapping, keyframes = PlanarMapping(CAMERA, CONFIG, NOISE.per_m2), []
-    speck = np.zeros((CAMERA.height, CAMERA.width), bool)
+    speck = np.zeros(CAMERA.shape, bool)
     speck[110:122, 240:252] = True
     for index, T_cw in enumerate(ALONG[:3]):
         depth_m, _ = measured([WALL], T_cw, index)

@@ -1,4 +1,4 @@
-"""Ids read back from colours of the palette, one by one."""
+"""Ids read back from colours of the palette: the twin of what the device reads off renderings."""
 
 import numpy as np
 
