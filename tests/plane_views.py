@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from tgslam.camera import Camera
+from tgslam.camera import Camera, SensorNoise
 from tgslam.config.input_settings import SyntheticConfig
 from tgslam.config.plane_settings import PlanesConfig
 from tgslam.datasets.built_in import SyntheticSource
@@ -14,16 +14,14 @@ from tgslam.geometry import inverse, se3_exp, tangent_axes
 from tgslam.planes.instances.registry import Observation, PlaneRegistry
 from tgslam.planes.segment import PlaneSegment, PlaneView
 
-DEPTH_SIGMA_PER_M2 = 0.0015
+NOISE = SensorNoise(0.0015)
 LEAST_AREA_SHARE = 0.004  # of the image that a segment takes
 RELIABLE_AREA_SHARE = 0.01  # below, a segment is ambiguous
 
 
 def points_c(camera: Camera, depth_m: np.ndarray) -> np.ndarray:
     """[H, W, 3] m."""
-    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
-    return rays * depth_m[..., None].astype(np.float64)
+    return camera.rays() * depth_m[..., None].astype(np.float64)
 
 
 def segment_of(
@@ -31,7 +29,7 @@ def segment_of(
 ) -> PlaneSegment:
     """The plane [4] with an error drawn from the covariance that a fit to the points [N, 3] would have."""
     normal = plane_c[:3] * (1.0 if plane_c[3] > 0 else -1.0)
-    sigma = DEPTH_SIGMA_PER_M2 * points[:, 2] ** 2
+    sigma = NOISE.sigma_m(points[:, 2])
     weight = 1.0 / sigma**2
     centroid = weight @ points / weight.sum()
     first, second = tangent_axes(normal)
@@ -106,6 +104,31 @@ def with_label_noise(view: PlaneView, rng: np.random.Generator, shift_px: int = 
     return replace(view, labels=labels)
 
 
+class Watched(PlaneRegistry):
+    """A registry and the poses of its keyframes, which otherwise others own."""
+
+    def __init__(self, config: PlanesConfig) -> None:
+        self.poses: dict[int, np.ndarray] = {}  # T_wc
+        super().__init__(config, NOISE, self.poses)
+
+    def show(
+        self, view: PlaneView, depth_m: np.ndarray, camera: Camera, T_cw: np.ndarray, keyframe: int
+    ) -> Observation:
+        """Observe a keyframe at T_cw."""
+        self.poses[keyframe] = inverse(T_cw)
+        return self.observe(view, depth_m, camera, T_cw, keyframe)
+
+    def move(self, motions: dict[int, np.ndarray]) -> tuple[tuple[int, int], ...]:
+        """Move keyframes, and the planes with them."""
+        for keyframe, motion in motions.items():
+            self.poses[keyframe] = motion @ self.poses[keyframe]
+        return self.follow(motions)
+
+    def living(self, plane_id: int) -> int:
+        """The id under which a PGI lives on; -1 = removed."""
+        return int(self.table.resolved(plane_id))
+
+
 @dataclass
 class Playback:
     """A built-in scene seen by a registry, with the true plane of every segment."""
@@ -123,7 +146,7 @@ class Playback:
         settings = SyntheticConfig(scene=self.scene, width=self.width, height=self.height, frames=self.frames)
         self.source = SyntheticSource(settings, self.seed)
         self.camera = self.source.camera
-        self.registry = PlaneRegistry(self.config, DEPTH_SIGMA_PER_M2)
+        self.registry = Watched(self.config)
         self.rng = np.random.default_rng(self.seed)
         self.sightings: list[tuple[int, int, int, float]] = []  # keyframe, true label, id, area m2
         self.observations: list[Observation] = []
@@ -148,7 +171,7 @@ class Playback:
         """Show the registry these frames as keyframes."""
         for index in indices:
             view, truth, depth_m = self.view(index)
-            seen = self.registry.observe(view, depth_m, self.camera, self.T_cw(index), index)
+            seen = self.registry.show(view, depth_m, self.camera, self.T_cw(index), index)
             self.observations.append(seen)
             for segment, label in enumerate(truth):
                 row = (index, int(label), int(seen.ids[segment]), view.segments[segment].area_m2)
@@ -166,7 +189,7 @@ class Playback:
         result: dict[int, list[int]] = {}
         for _, label, plane_id, _ in self.sightings:
             if plane_id >= 0 and np.median(areas[label]) >= least_area_m2:
-                result.setdefault(label, []).append(self.registry.resolve(plane_id))
+                result.setdefault(label, []).append(self.registry.living(plane_id))
         return result
 
 
@@ -189,7 +212,7 @@ class Rectangle:
 def cast(rectangles: list[Rectangle], camera: Camera, T_cw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Exact depth [H, W] m and the index of the rectangle seen at each pixel, -1 = none."""
     T_wc = inverse(T_cw)
-    rays = points_c(camera, np.ones((camera.height, camera.width))) @ T_wc[:3, :3].T
+    rays = points_c(camera, np.ones(camera.shape)) @ T_wc[:3, :3].T
     depth, labels = np.full(rays.shape[:2], np.inf), np.full(rays.shape[:2], -1)
     for i, rectangle in enumerate(rectangles):
         plane = rectangle.plane
@@ -222,7 +245,7 @@ class Stage:
     camera: Camera = field(default_factory=lambda: Camera(200, 150, 140.0, 140.0, 99.5, 74.5))
 
     def __post_init__(self) -> None:
-        self.registry = PlaneRegistry(self.config, DEPTH_SIGMA_PER_M2)
+        self.registry = Watched(self.config)
         self.rng = np.random.default_rng(5)
         self.keyframe = -1
 
@@ -237,7 +260,7 @@ class Stage:
         """A keyframe at T_cw, which is taken to be at `believed`. Returns with the ids that each rectangle got."""
         shown = self.rectangles if rectangles is None else rectangles
         depth_m, labels = cast(shown, self.camera, T_cw)
-        noise = DEPTH_SIGMA_PER_M2 * depth_m**2 * self.rng.standard_normal(depth_m.shape)
+        noise = NOISE.sigma_m(depth_m) * self.rng.standard_normal(depth_m.shape)
         planes = np.array([rectangle.plane for rectangle in shown])
         normals = planes[:, :3] @ T_cw[:3, :3].T
         planes_c = np.column_stack([normals, planes[:, 3] - normals @ T_cw[:3, 3]])
@@ -247,7 +270,7 @@ class Stage:
             for segment, label in zip(view.segments, truth, strict=True)
         )
         self.keyframe += 1
-        seen = self.registry.observe(
+        seen = self.registry.show(
             replace(view, segments=segments),
             (depth_m + noise).astype(np.float32),
             self.camera,

@@ -115,6 +115,39 @@ def test_an_unknown_key_names_file_key_neighbour_and_range(tmp_path: Path) -> No
     assert "base" in message(None, "base=tum")
 
 
+def test_expert_settings_lie_below_their_section(tmp_path: Path) -> None:
+    config = load(None, ["planes.expert.association.gate_sigmas=3", "structure.expert.shape.thinness=0.2"])
+    assert (config.planes.expert.association.gate_sigmas, config.structure.expert.shape.thinness) == (3.0, 0.2)
+    assert config.planes.expert.gaps == Config().planes.expert.gaps
+    path = written(tmp_path, "planes:\n  expert:\n    association: {gate_sigmas: 2.0}\n    gaps: {bridge_m: 1}\n")
+    expert = load(path, ["planes.expert.gaps.bridge_m=2"]).planes.expert
+    assert (expert.association.gate_sigmas, expert.gaps.bridge_m) == (2.0, 2.0)
+
+
+def test_errors_of_expert_settings_lead_to_them() -> None:
+    gate = "`planes.expert.association.gate_sigmas`"
+    assert f"did you mean {gate} (a number from 0.5 to 100.0)?" in message(None, "planes.gate_sigmas=3")
+    assert f"did you mean {gate}" in message(None, "planes.expert.gate_sigmas=3")
+    assert f"did you mean {gate}" in message(None, "planes.expert.association.gate_sigma=3")
+    assert "did you mean the section `planes.expert.association`" in message(None, "planes.expert.asociation.x=3")
+    assert f"{gate} = 0 is out of range" in message(None, "planes.expert.association.gate_sigmas=0")
+    assert "`planes.expert` is a section" in message(None, "planes.expert=3")
+
+
+def names_in(section: Any) -> list[str]:
+    """Of all settings in a section and those below it."""
+    inner = {field.name: getattr(section, field.name) for field in dataclasses.fields(section)}
+    below = [name for value in inner.values() if dataclasses.is_dataclass(value) for name in names_in(value)]
+    return [name for name, value in inner.items() if not dataclasses.is_dataclass(value)] + below
+
+
+def test_a_setting_of_planes_has_a_name_of_its_own() -> None:
+    config = Config()
+    everything = names_in(config)
+    twice = {name for name in names_in(config.planes) + names_in(config.structure) if everything.count(name) > 1}
+    assert twice == {"enabled"}  # which means the same everywhere
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [

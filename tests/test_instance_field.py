@@ -1,12 +1,12 @@
 """The instance field: weights, E_pgi and its gradient, relaxation, ids read back, and how fast embeddings learn."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from tests.reference import instance_field as reference
+from tests.reference.palette import ids_of
 from tests.test_loss_kernels import assert_gradient, central
+from tests.tiers import changed
 from tgslam.bench.ablation import identity_study as identity
 from tgslam.config.plane_settings import StructureConfig
 from tgslam.device import runtime
@@ -15,7 +15,8 @@ from tgslam.ops import instance_field
 from tgslam.planes.identity import palette
 from tgslam.planes.identity.codes import code_table, codes_of, read_ids
 
-CONFIG = StructureConfig(lambda_pgi=0.7, scalar_ids=12)
+CONFIG = changed(StructureConfig(), lambda_pgi=0.7, scalar_ids=12)
+FIELD = CONFIG.expert.embedding
 OTHER = 2.0**-10  # a derivative by opacity that is there before
 SIZES = [(48, 64), (37, 50), (9, 33)]
 
@@ -35,7 +36,7 @@ def scene(height=37, width=50, seed=0):
 
 def evaluate(rendering, ids, depth, codes, config=CONFIG):
     """E_pgi's gradient, the target, and the derivative by opacity, which was added to another one."""
-    target = instance_field.prepare(ids, runtime.to_device(depth), config)
+    target = instance_field.prepare(ids, runtime.to_device(depth), config.expert.embedding)
     g_opacity = runtime.to_device(np.full(ids.shape, OTHER))
     embedding, opacity = (runtime.to_device(image) for image in rendering)
     found = instance_field.pgi_loss(
@@ -47,8 +48,8 @@ def evaluate(rendering, ids, depth, codes, config=CONFIG):
 @pytest.mark.parametrize("size", SIZES)
 def test_weights_match_the_twin(size):
     _, ids, depth, _ = scene(*size)
-    target = instance_field.prepare(ids, runtime.to_device(depth), CONFIG)
-    expected = reference.weights(ids, depth, CONFIG)
+    target = instance_field.prepare(ids, runtime.to_device(depth), FIELD)
+    expected = reference.weights(ids, depth, FIELD)
     np.testing.assert_allclose(runtime.to_host(target.weight), expected, rtol=1e-6)
     assert runtime.to_host(target.counted)[0] == (expected > 0).sum()
 
@@ -59,12 +60,12 @@ def test_weights_are_told_apart():
     ids[12:, 20:] = -1
     depth = np.ones(ids.shape, np.float32)
     depth[:, 3:5] = 0
-    weight = runtime.to_host(instance_field.prepare(ids, runtime.to_device(depth), CONFIG).weight)
+    weight = runtime.to_host(instance_field.prepare(ids, runtime.to_device(depth), FIELD).weight)
     assert weight[3, 1] == 1.0  # inside a plane, and beside a hole in the depth
     assert weight[3, 3] == 0.0
-    assert weight[3, 8] == weight[3, 9] == weight[3, 10] == weight[3, 11] == 1.0 + CONFIG.edge_boost
+    assert weight[3, 8] == weight[3, 9] == weight[3, 10] == weight[3, 11] == 1.0 + FIELD.edge_boost
     assert weight[3, 7] == weight[3, 12] == 1.0
-    assert weight[17, 27] == CONFIG.weight_none
+    assert weight[17, 27] == FIELD.no_plane_weight
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -153,12 +154,12 @@ def looked_at(theta, covered_px, plane_id, most_px, config):
     return runtime.to_host(moved)[0].astype(float)
 
 
-@pytest.mark.parametrize(("fringe_share", "expected"), [(CONFIG.fringe_share, 3), (0.0, 7)])
+@pytest.mark.parametrize(("fringe_share", "expected"), [(FIELD.fringe_share, 3), (0.0, 7)])
 def test_views_of_a_fringe_do_not_overwrite_what_a_good_view_has_told(fringe_share, expected):
-    config = replace(CONFIG, fringe_share=fringe_share)
+    config = changed(CONFIG, fringe_share=fringe_share)
 
     def shown(theta):
-        return palette.ids_of(1 / (1 + np.exp(-theta[None])), np.arange(8), CONFIG.read_margin)[0]
+        return ids_of(1 / (1 + np.exp(-theta[None])), np.arange(8), CONFIG.expert.reading.read_margin)[0]
 
     theta = instance_field.theta_of(codes_of([3], config))[0].astype(float)
     for _ in range(10):
@@ -184,7 +185,7 @@ def test_ids_are_read_as_by_the_twin(margin, known):
     colour = np.clip(palette.colours(truth) + 0.1 * rng.normal(size=(height, width, 3)), 0, 1)
     opacity = np.float32(rng.uniform(0.2, 1.0, (height, width)))
     embedding = np.float32(opacity[..., None] * colour)
-    config = replace(CONFIG, read_margin=margin)
+    config = changed(CONFIG, read_margin=margin)
     found = read_ids(runtime.to_device(embedding), runtime.to_device(opacity), np.arange(known), config)
     ids = np.arange(-1, known)
     expected = reference.read(
@@ -193,19 +194,21 @@ def test_ids_are_read_as_by_the_twin(margin, known):
     assert (found != expected).mean() < 1e-3  # rounding, where two codes are as far
     assert (found >= 0).any() == (known > 0)
     if known:
-        rows = palette.ids_of((embedding / opacity[..., None])[opacity >= 0.5], np.arange(known), margin)
+        rows = ids_of((embedding / opacity[..., None])[opacity >= 0.5], np.arange(known), margin)
         assert (found[opacity >= 0.5] != rows).mean() < 1e-3
 
 
 def test_scalar_ids_are_rounded():
-    config = replace(CONFIG, identity="scalar", read_margin=0.0)
-    ids = np.arange(-1, config.scalar_ids)
+    config = changed(CONFIG, identity="scalar", read_margin=0.0)
+    ids = np.arange(-1, config.expert.embedding.scalar_ids)
     steps = np.array([-0.4, 0.0, 0.4])
     truth = np.repeat(ids, len(steps)).reshape(1, -1)
     first = np.interp(truth + np.tile(steps, len(ids)), ids, codes_of(ids, config)[:, 0])
     opacity = np.full(truth.shape, 0.8)
     embedding = 0.8 * np.stack([first, *np.full((2, *truth.shape), 0.5)], axis=-1)
-    found = read_ids(runtime.to_device(embedding), runtime.to_device(opacity), np.arange(config.scalar_ids), config)
+    found = read_ids(
+        runtime.to_device(embedding), runtime.to_device(opacity), np.arange(config.expert.embedding.scalar_ids), config
+    )
     np.testing.assert_array_equal(found, truth)
     assert (codes_of(ids, config)[:, 1:] == 0.5).all()
 

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.mapper import Mapper
+from tests.tiers import changed
 from tgslam.config.input_settings import SyntheticConfig
 from tgslam.config.map_settings import LossConfig, MappingConfig
 from tgslam.config.plane_settings import PlanesConfig, StructureConfig
@@ -287,7 +288,7 @@ def unseen_psnr(mapper: Mapper, source: SyntheticSource) -> float:
 
 
 def test_the_final_refinement_learns_what_keyframes_show_of_planes_in_the_end(source: SyntheticSource) -> None:
-    structure, config = StructureConfig(pgi_interval=1), MappingConfig(iterations=0, final_iterations=8)
+    structure, config = changed(StructureConfig(), pgi_interval=1), MappingConfig(iterations=0, final_iterations=8)
     mapper = Mapper(source.camera, config, PlanesConfig(enabled=True), structure)
     for index in (0, 10):
         add(mapper, source, source.read(index))

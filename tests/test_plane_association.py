@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose
 from tests.plane_views import Rectangle, Stage, looking
 from tests.plane_worlds import shifted
 from tests.test_plane_estimate import random_plane, random_pose
+from tests.tiers import changed
 from tgslam.config.plane_settings import PlanesConfig
 from tgslam.geometry import inverse, so3_exp, tangent_axes, transform_points
 from tgslam.keyframing.structure_cue import StructureCue
@@ -71,9 +72,7 @@ def test_overlap_counts_samples() -> None:
 
 
 def test_the_cost_is_equation_7() -> None:
-    config = PlanesConfig(
-        weight_angle=2.0, weight_offset=3.0, weight_overlap=5.0, max_angle_rad=0.1, max_offset_ratio=0.2
-    )
+    config = changed(PlanesConfig(), matching_weights=(2.0, 3.0, 5.0), max_angle_rad=0.1, max_offset_ratio=0.2)
     agreement = Agreement(np.array([0.05]), np.array([0.1]), np.array([0.0]), np.array([True]))
     assert_allclose(matching_cost(agreement, np.array([0.4]), config), 2 * 0.5 + 3 * 0.5 + 5 * 0.6)
 

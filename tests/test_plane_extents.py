@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tests.plane_views import DEPTH_SIGMA_PER_M2, Rectangle, Stage, cast, looking, points_c
+from tests.plane_views import NOISE, Rectangle, Stage, cast, looking, points_c
 from tgslam.config.plane_settings import PlanesConfig
 from tgslam.errors import EvaluationError
 from tgslam.evaluation.trajectory import align_poses
@@ -22,7 +22,7 @@ HERE = looking((0.1, 1.0, 1.3), (0.0, 3.0, 1.1))
 
 def extents(stage: Stage, depth_m: np.ndarray) -> KnownExtents:
     rays = points_c(stage.camera, np.ones(depth_m.shape))
-    return KnownExtents(stage.registry.instances, depth_m, rays, HERE, PlanesConfig(), DEPTH_SIGMA_PER_M2)
+    return KnownExtents(stage.registry.instances, depth_m, rays, HERE, PlanesConfig(), NOISE.per_m2)
 
 
 def test_pixels_without_a_segment_are_those_of_the_plane_they_lie_on() -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from tgslam.camera import Camera
+from tgslam.camera import Camera, SensorNoise
 from tgslam.config.input_settings import SyntheticConfig
 from tgslam.config.plane_settings import PlanesConfig
 from tgslam.datasets.built_in import SyntheticSource
@@ -22,17 +22,13 @@ from tgslam.planes.segmentation.extraction import extract_planes
 SIGMA = 0.0015
 CAMERA = Camera(320, 240, 280.0, 275.0, 158.0, 121.0)
 CONFIG = PlanesConfig()
+LIMITS = CONFIG.expert.segmentation
 WALL = (0.0, 0.0, -1.0)
-
-
-def rays(camera: Camera = CAMERA) -> np.ndarray:
-    v, u = np.mgrid[: camera.height, : camera.width]
-    return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
 
 
 def plane_depth(normal, offset_m: float, camera: Camera = CAMERA) -> np.ndarray:
     """[H, W] depth of n . x + d = 0; infinite where a ray does not meet it."""
-    along = -rays(camera) @ (np.asarray(normal) / np.linalg.norm(normal))
+    along = -camera.rays() @ (np.asarray(normal) / np.linalg.norm(normal))
     return np.where(along > 1e-6, offset_m / np.maximum(along, 1e-6), np.inf)
 
 
@@ -42,7 +38,9 @@ def seen(
     """What is extracted from an exact depth image, with the sensor's noise added; seed None: without."""
     noise = 0.0 if seed is None else SIGMA * np.random.default_rng(seed).normal(size=exact_m.shape)
     depth_m = np.where(np.isfinite(exact_m) & (exact_m > 0), 1.0 / (1.0 / np.maximum(exact_m, 1e-6) + noise), 0.0)
-    return extract_planes(runtime.to_device(np.ascontiguousarray(depth_m, np.float32)), camera, config, SIGMA)
+    return extract_planes(
+        runtime.to_device(np.ascontiguousarray(depth_m, np.float32)), camera, config, SensorNoise(SIGMA)
+    )
 
 
 def deviation(segment, normal, offset_m) -> np.ndarray:
@@ -151,7 +149,7 @@ def tables() -> tuple[np.ndarray, np.ndarray]:
     """Two table tops at one height, 0.2 m apart, over a floor; and a mask of the tops."""
     up = np.array([0.0, -1.0, -1.0]) / np.sqrt(2)
     top, floor = plane_depth(up, 1.2), plane_depth(up, 1.9)
-    across = rays()[..., 0] * top
+    across = CAMERA.rays()[..., 0] * top
     on_top = (abs(across) > 0.1) & (abs(across) < 0.9) & (np.arange(240)[:, None] > 40)
     return np.where(on_top, top, floor), on_top
 
@@ -191,8 +189,8 @@ def test_a_cell_across_an_oblique_step_is_not_plane(step_m):
     near = v - 120 > 0.4 * (u - 160)
     noise = SIGMA * np.random.default_rng(0).normal(size=near.shape)
     depth_m = 1.0 / (1.0 / np.where(near, 3.0 - step_m, 3.0) + noise)
-    grid = CellGrid.across(CAMERA, CONFIG.cells_across)
-    graph = planar_cells(runtime.to_device(np.float32(depth_m)), grid, SIGMA, CONFIG.cell_share, CONFIG.cell_sigmas)
+    grid = CellGrid.across(CAMERA, CONFIG.segmentation_cells_across)
+    graph = planar_cells(runtime.to_device(np.float32(depth_m)), grid, SIGMA, LIMITS.cell_share, LIMITS.cell_sigmas)
     rows, columns = grid.shape
     share = near.reshape(rows, grid.cell_px, columns, grid.cell_px).mean(axis=(1, 3)).ravel()
     across = (share > 0.25) & (share < 0.75)
@@ -243,7 +241,7 @@ def test_a_wall_that_a_board_hides_a_part_of_is_one():
 @pytest.mark.parametrize("radius_m", [0.15, 0.4, 0.8, 1.5])
 def test_a_cylinder_is_no_plane(radius_m):
     """Its axis is upright, and its front 1.2 m from the camera."""
-    r = rays()
+    r = CAMERA.rays()
     a, b, c = r[..., 0] ** 2 + 1.0, -(1.2 + radius_m), (1.2 + radius_m) ** 2 - radius_m**2
     inside = b * b - a * c
     exact_m = np.where(inside > 0, (-b - np.sqrt(np.maximum(inside, 0.0))) / a, 0.0)
@@ -251,7 +249,7 @@ def test_a_cylinder_is_no_plane(radius_m):
 
 
 def test_a_sphere_is_no_plane():
-    r = rays()
+    r = CAMERA.rays()
     a, b, c = (r**2).sum(axis=-1), -1.7, 1.7**2 - 0.5**2
     inside = b * b - a * c
     exact_m = np.where(inside > 0, (-b - np.sqrt(np.maximum(inside, 0.0))) / a, 0.0)
@@ -295,13 +293,13 @@ def test_tiny_images(size):
 @pytest.mark.parametrize("value", [0.0, np.nan])
 def test_without_measurements_there_is_nothing(value):
     depth_m = np.full((240, 320), value, np.float32)
-    view = extract_planes(runtime.to_device(depth_m), CAMERA, CONFIG, SIGMA)
+    view = extract_planes(runtime.to_device(depth_m), CAMERA, CONFIG, SensorNoise(SIGMA))
     assert view.segments == () and (view.labels == -1).all()
 
 
 def test_a_wrong_size_is_refused():
     with pytest.raises(ValueError, match="depth_m"):
-        extract_planes(np.ones((10, 10), np.float32), CAMERA, CONFIG, SIGMA)
+        extract_planes(np.ones((10, 10), np.float32), CAMERA, CONFIG, SensorNoise(SIGMA))
 
 
 @pytest.fixture(scope="module")
@@ -319,7 +317,7 @@ def test_rooms_under_sensor_noise(sources, scene):
     errors = []
     for index in (10, 90, 200):
         depth_m, labels = source.read(index).depth_m, source.labels(index)
-        view = extract_planes(runtime.to_device(depth_m), source.camera, CONFIG, SIGMA)
+        view = extract_planes(runtime.to_device(depth_m), source.camera, CONFIG, SensorNoise(SIGMA))
         on_planes = (view.labels >= 0)[(labels >= 0) & (depth_m > 0)].mean()
         assert on_planes > 0.8
         for k, segment in enumerate(view.segments):
@@ -338,7 +336,7 @@ def test_rooms_under_sensor_noise(sources, scene):
 def test_it_repeats_bit_for_bit(sources):
     depth_m = sources["desk"].read(40).depth_m
     first, second = (
-        extract_planes(runtime.to_device(depth_m), sources["desk"].camera, CONFIG, SIGMA) for _ in range(2)
+        extract_planes(runtime.to_device(depth_m), sources["desk"].camera, CONFIG, SensorNoise(SIGMA)) for _ in range(2)
     )
     np.testing.assert_array_equal(first.labels, second.labels)
     for a, b in zip(first.segments, second.segments, strict=True):
@@ -350,7 +348,7 @@ def test_it_repeats_bit_for_bit(sources):
 def test_the_depth_image_is_left_alone(sources):
     depth_m = sources["desk"].read(40).depth_m
     before = depth_m.copy()
-    extract_planes(runtime.to_device(depth_m), sources["desk"].camera, CONFIG, SIGMA)
+    extract_planes(runtime.to_device(depth_m), sources["desk"].camera, CONFIG, SensorNoise(SIGMA))
     np.testing.assert_array_equal(depth_m, before)
 
 

@@ -8,15 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.plane_views import DEPTH_SIGMA_PER_M2, Rectangle, cast, looking, points_c, segment_of
-from tgslam.camera import Camera, SensorNoise
+from tests.plane_views import NOISE, Rectangle, Watched, cast, looking, points_c, segment_of
+from tgslam.camera import Camera
 from tgslam.config.plane_settings import PlanesConfig
 from tgslam.device import runtime
 from tgslam.map.keyframes import Keyframe
 from tgslam.map.world import Map
 from tgslam.mapping.plane_observation import PlaneObserver
 from tgslam.ops.plane_fit import CellGrid
-from tgslam.planes.instances.registry import PlaneRegistry
 from tgslam.planes.segment import PlaneView
 from tgslam.planes.segmentation.cells import planar_cells
 from tgslam.planes.segmentation.extraction import extract_planes
@@ -26,6 +25,7 @@ from tgslam.types import Exposure, Frame
 
 CAMERA = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
 CONFIG = PlanesConfig()
+LIMITS = CONFIG.expert.segmentation
 WALL = Rectangle((0.0, 2.0, 1.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (6.0, 3.0))
 BOARD = Rectangle((0.0, 1.985, 0.6), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (6.0, 0.08))
 ALONG = [looking((x, 0.0, 1.2), (x + 0.1, 2.0, 0.9)) for x in np.linspace(-0.5, 0.5, 8)]
@@ -34,12 +34,12 @@ ALONG = [looking((x, 0.0, 1.2), (x + 0.1, 2.0, 0.9)) for x in np.linspace(-0.5, 
 def measured(rectangles: list[Rectangle], T_cw: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Depth with the sensor's noise, and the rectangle of each pixel."""
     depth_m, labels = cast(rectangles, CAMERA, T_cw)
-    noise = DEPTH_SIGMA_PER_M2 * depth_m**2 * np.random.default_rng(seed).standard_normal(depth_m.shape)
+    noise = NOISE.sigma_m(depth_m) * np.random.default_rng(seed).standard_normal(depth_m.shape)
     return np.where(depth_m > 0, depth_m + noise, 0.0).astype(np.float32), labels
 
 
 def seen(depth_m: np.ndarray) -> PlaneView:
-    return extract_planes(runtime.to_device(depth_m), CAMERA, CONFIG, DEPTH_SIGMA_PER_M2)
+    return extract_planes(runtime.to_device(depth_m), CAMERA, CONFIG, NOISE)
 
 
 def rolled(T_cw: np.ndarray, roll_deg: float) -> np.ndarray:
@@ -80,7 +80,7 @@ def measured_alike(rectangles: list[Rectangle], T_cw: np.ndarray, seed: int) -> 
     white = np.random.default_rng(seed).standard_normal(depth_m.shape)
     kernel = cv2.getGaussianKernel(5, 0.7)
     noise = cv2.sepFilter2D(white, -1, kernel, kernel) / np.sum(kernel**2)
-    return np.where(depth_m > 0, depth_m + DEPTH_SIGMA_PER_M2 * depth_m**2 * noise, 0.0).astype(np.float32), labels
+    return np.where(depth_m > 0, depth_m + NOISE.sigma_m(depth_m) * noise, 0.0).astype(np.float32), labels
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -89,10 +89,10 @@ def test_a_strip_that_no_cell_tells_from_the_wall_is_found_along_it_and_kept(see
     T_cw = rolled(looking((0.0, 0.0, 1.2), (0.0, 3.7, 0.8)), roll_deg)
     depth_m, labels = measured_alike([FAR_WALL, FAR_BOARD], T_cw, seed)
     grid = CellGrid(CAMERA, 4)
-    graph = planar_cells(runtime.to_device(depth_m), grid, DEPTH_SIGMA_PER_M2, CONFIG.cell_share, CONFIG.cell_sigmas)
+    graph = planar_cells(runtime.to_device(depth_m), grid, NOISE.per_m2, LIMITS.cell_share, LIMITS.cell_sigmas)
     board = labels.reshape(60, 4, 80, 4).mean(axis=(1, 3)).ravel()[graph.cell]
-    agreement = Agreement(DEPTH_SIGMA_PER_M2, CONFIG.join_sigmas, 0.0, CONFIG.join_shift_m)
-    group, parent = part_layers(graph, grid.shape, np.zeros(len(board), np.intp), agreement, least_px=230.0)
+    agreement = Agreement(NOISE.per_m2, LIMITS.join_sigmas, 0.0, LIMITS.join_shift_m)
+    group, parent = part_layers(graph, grid.shape, np.zeros(len(board), np.intp), agreement, 230.0, CONFIG.expert.steps)
     strip = np.isin(group, np.flatnonzero(parent == 0))
     assert np.mean(board[strip] > 0.1) > 0.6
     assert np.mean(strip[board > 0.9]) > 0.4
@@ -141,7 +141,7 @@ def settled(depth_m: np.ndarray, small_rows: slice) -> np.ndarray:
     What is left of the post starts as one large group, its right side between those rows of cells as a small one.
     """
     grid = CellGrid(CAMERA, 4)
-    graph = planar_cells(runtime.to_device(depth_m), grid, DEPTH_SIGMA_PER_M2, CONFIG.cell_share, CONFIG.cell_sigmas)
+    graph = planar_cells(runtime.to_device(depth_m), grid, NOISE.per_m2, LIMITS.cell_share, LIMITS.cell_sigmas)
     start = np.full(grid.shape, -1)
     start[:, :66] = 0
     start[small_rows, 66:] = 1
@@ -152,9 +152,9 @@ def settled(depth_m: np.ndarray, small_rows: slice) -> np.ndarray:
 
 def behind_a_post(board: tuple[slice, slice], step_m: float, seed: int) -> np.ndarray:
     """Depth of a wall, four times as noisy as the sensor should be, with a board on it; none where the post stands."""
-    depth_m = np.full((CAMERA.height, CAMERA.width), 2.0)
+    depth_m = np.full(CAMERA.shape, 2.0)
     depth_m[board] -= step_m
-    depth_m += 4.0 * DEPTH_SIGMA_PER_M2 * np.random.default_rng(seed).standard_normal(depth_m.shape)
+    depth_m += 4.0 * NOISE.per_m2 * np.random.default_rng(seed).standard_normal(depth_m.shape)
     depth_m[:, 260:272] = 0.0
     return depth_m.astype(np.float32)
 
@@ -181,12 +181,12 @@ def test_a_narrow_board_keeps_the_few_cells_that_noise_puts_on_the_wall(step_m: 
 
 
 def test_the_registry_keeps_a_board_and_its_wall_apart() -> None:
-    registry = PlaneRegistry(CONFIG, DEPTH_SIGMA_PER_M2)
+    registry = Watched(CONFIG)
     ids = []
     for keyframe, T_cw in enumerate(ALONG):
         depth_m, labels = measured([WALL, BOARD], T_cw, keyframe)
         view = seen(depth_m)
-        found = registry.observe(view, depth_m, CAMERA, T_cw, keyframe)
+        found = registry.show(view, depth_m, CAMERA, T_cw, keyframe)
         ids.append((found.ids[0], found.ids[of_board(view, labels)]))
     walls, boards = {wall for wall, _ in ids}, {board for _, board in ids if board >= 0}
     assert len(walls) == len(boards) == 1
@@ -200,12 +200,12 @@ def test_the_registry_keeps_a_board_and_its_wall_apart() -> None:
 FAR = looking((0.2, -2.0, 1.2), (0.2, 2.0, 0.7))  # 4 m off: the noise is larger than the step, the board 5 px wide
 
 
-def told_of_a_board() -> PlaneRegistry:
+def told_of_a_board() -> Watched:
     """A registry that knows a board on a wall from nearby."""
-    registry = PlaneRegistry(CONFIG, DEPTH_SIGMA_PER_M2)
+    registry = Watched(CONFIG)
     for keyframe, T_cw in enumerate(ALONG[::2]):
         depth_m, _ = measured([WALL, BOARD], T_cw, keyframe)
-        registry.observe(seen(depth_m), depth_m, CAMERA, T_cw, keyframe)
+        registry.show(seen(depth_m), depth_m, CAMERA, T_cw, keyframe)
     return registry
 
 
@@ -227,7 +227,7 @@ def test_a_far_view_shows_a_board_that_it_could_not_tell_by_itself(seed: int) ->
     assert part.offset_m < view.segments[0].offset_m - 0.007
     assert abs(part.normal_c @ part.centroid_c + part.offset_m) < 0.001
     assert not part.reliable
-    observed = registry.observe(view, depth_m, CAMERA, FAR, 9)
+    observed = registry.show(view, depth_m, CAMERA, FAR, 9)
     (parted,) = registry.parted_from(int(observed.ids[0]))
     assert observed.ids[-1] == parted.id
 
@@ -259,8 +259,8 @@ class Observed:
 
     def __init__(self) -> None:
         config = replace(CONFIG, enabled=True)
-        self.map = Map(CAMERA, SensorNoise(DEPTH_SIGMA_PER_M2), config)
-        self.observer = PlaneObserver(CAMERA, config, self.map.noise)
+        self.map = Map(CAMERA, NOISE, config)
+        self.observer = PlaneObserver(CAMERA, config, NOISE)
 
     def observe(self, T_cw: np.ndarray, depth_m: np.ndarray) -> None:
         frame = Frame(len(self.map.keyframes), 0.0, np.zeros((*depth_m.shape, 3), np.float32), depth_m)
@@ -305,7 +305,7 @@ def test_a_surface_that_waits_for_other_views_is_no_part_of_the_floor_that_it_st
 
 def test_keyframes_show_in_the_end_what_only_later_ones_have_seen_of_a_plane() -> None:
     world = Observed()
-    speck = np.zeros((CAMERA.height, CAMERA.width), bool)
+    speck = np.zeros(CAMERA.shape, bool)
     speck[110:122, 240:252] = True
     for index, T_cw in enumerate(ALONG[:3]):
         depth_m, _ = measured([WALL], T_cw, index)
@@ -331,11 +331,11 @@ def test_bordering_labels_are_listed_in_both_orders() -> None:
 
 
 def test_a_boards_extent_is_not_worn_away_by_the_wall_beside_it() -> None:
-    registry = PlaneRegistry(CONFIG, DEPTH_SIGMA_PER_M2)
+    registry = Watched(CONFIG)
     for keyframe in range(12):
         depth_m, labels = measured([WALL, BOARD], ALONG[4], keyframe)
         view = seen(depth_m)
-        found = registry.observe(view, depth_m, CAMERA, ALONG[4], keyframe)
+        found = registry.show(view, depth_m, CAMERA, ALONG[4], keyframe)
     board = registry.instances[int(found.ids[of_board(view, labels)])]
     wall = registry.instances[int(found.ids[0])]
     in_view = Rectangle((0.1, 1.985, 0.6), BOARD.along, BOARD.across, (2.0, 0.08))
@@ -358,11 +358,11 @@ def test_a_piece_of_a_surface_is_not_taken_for_a_smaller_one_before_it_that_the_
     T_cw = looking((0.0, 0.0, 1.0), (0.0, 2.0, 1.0))
     depth_m, labels = cast([WALL, patch], CAMERA, T_cw)
     wall, front, between = (np.array([0.0, 0.0, -1.0, z]) for z in (2.0, 1.975, 1.985))
-    registry = PlaneRegistry(CONFIG, DEPTH_SIGMA_PER_M2)
-    first = registry.observe(labelled(depth_m, labels, [wall, front]), depth_m, CAMERA, T_cw, 0)
+    registry = Watched(CONFIG)
+    first = registry.show(labelled(depth_m, labels, [wall, front]), depth_m, CAMERA, T_cw, 0)
     halves = np.zeros_like(labels)
     halves[:, 150:] = -1
     halves[70:170, 170:280] = 1
-    second = registry.observe(labelled(depth_m, halves, [wall, between]), depth_m, CAMERA, T_cw, 1)
+    second = registry.show(labelled(depth_m, halves, [wall, between]), depth_m, CAMERA, T_cw, 1)
     assert second.ids.tolist() == [first.ids[0], first.ids[0]]
     assert registry.instances[int(first.ids[1])].keyframes == [0]

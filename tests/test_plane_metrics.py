@@ -33,7 +33,7 @@ class FakeTruth:
     """The wall of `FakeSystem` in the left half of every image, and at its right a plane that is too small."""
 
     def labels(self, index: int) -> np.ndarray:
-        labels = np.full((CAMERA.height, CAMERA.width), 1, np.int32)
+        labels = np.full(CAMERA.shape, 1, np.int32)
         labels[:, : CAMERA.width // 2] = 0
         return labels
 

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
-from tgslam.planes.identity.palette import colours, ids_of
+from tests.reference.palette import ids_of
+from tgslam.planes.identity.palette import colours
 
 
 @pytest.mark.parametrize(("count", "least"), [(8, 0.6), (16, 0.4), (64, 0.23), (256, 0.12)])

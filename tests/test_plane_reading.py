@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tgslam.camera import Camera
+from tgslam.camera import Camera, SensorNoise
 from tgslam.config.plane_settings import StructureConfig
 from tgslam.planes.identity.outline import Outline
 from tgslam.planes.identity.reading import PlaneReader
@@ -40,7 +40,7 @@ def test_a_plane_without_outlines_has_no_bounds() -> None:
 
 @pytest.mark.parametrize("depth_m", [2.0, 2.5])
 def test_ids_hold_on_their_plane_and_with_what_adjoins_its_outline(depth_m: float) -> None:
-    reader = PlaneReader(CAMERA, [facing(square(-1.0, 0.0, 0.4))], StructureConfig(), 0.0015)
+    reader = PlaneReader(CAMERA, [facing(square(-1.0, 0.0, 0.4))], StructureConfig(), SensorNoise(0.0015))
     ids = np.full((60, 100), -1, np.int32)
     ids[25:35, 20:60] = 7  # from where it has been seen to 0.8 m beyond
     ids[5:10, 20:30] = 7  # where it has not

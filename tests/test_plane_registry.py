@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tests.plane_views import Playback, Rectangle, Stage, looking
+from tests.plane_views import NOISE, Playback, Rectangle, Stage, looking
+from tests.tiers import changed
 from tgslam.config.plane_settings import PlanesConfig
 from tgslam.geometry import inverse, se3_exp, tangent_axes
 from tgslam.planes.estimate import PlaneEstimate, deviation_sigmas
@@ -176,8 +177,8 @@ def test_far_ends_of_a_floor_are_one_though_nothing_between_them_was_seen() -> N
     stage = Stage(hall)
     _, left = stage.show(looking((-4.5, 0.0, 1.4), (-6.0, 2.0, 0.2)))
     _, right = stage.show(looking((4.5, 0.0, 1.4), (6.0, 2.0, 0.2)))
-    assert stage.registry.resolve(left[0][0]) == right[0][0]
-    assert stage.registry.resolve(left[1][0]) == right[1][0]
+    assert stage.registry.living(left[0][0]) == right[0][0]
+    assert stage.registry.living(left[1][0]) == right[1][0]
     assert len(set(right[0] + right[1])) == 2
 
 
@@ -224,7 +225,7 @@ def test_what_most_views_do_not_show_in_a_gap_parts_nothing(often: int, surfaces
         before = rail if view % often else board
         _, ids = stage.show(looking((float(x), 0.9, 1.25), (0.0, 3.0, 1.2)), rectangles=[*fronts, WALL, before])
     assert len({*ids[0], *ids[1]}) == surfaces
-    assert len({stage.registry.resolve(found[0]) for found in (ids[0], ids[1])}) == surfaces
+    assert len({stage.registry.living(found[0]) for found in (ids[0], ids[1])}) == surfaces
 
 
 def test_what_was_taken_for_one_surface_is_parted_when_views_look_through_it() -> None:
@@ -250,7 +251,7 @@ def test_a_bent_piece_becomes_part_of_the_surface_to_which_views_count_it() -> N
     merged = [stage.show(T_cw)[0].merged for T_cw in wandering(6)]
     assert merged.count(((wall, scrap),)) == 1
     assert merged[0] == merged[1] == ()  # not at the first view
-    assert stage.registry.resolve(scrap) == wall
+    assert stage.registry.living(scrap) == wall
     assert_allclose(stage.registry.instances[wall].normal_w, [0, -1, 0], atol=0.005)
 
 
@@ -283,27 +284,27 @@ def test_a_wall_cut_at_random_is_one() -> None:
     for T_cw in wandering(12):
         _, ids = stage.show(T_cw, pieces=3)
     for found in ids.values():
-        assert len({stage.registry.resolve(plane_id) for plane_id in found}) == 1
+        assert len({stage.registry.living(plane_id) for plane_id in found}) == 1
     assert len(stage.registry.instances) == 3
 
 
 def test_parts_of_a_wall_that_were_seen_apart_become_one_when_the_rest_is_seen() -> None:
     small = replace(WALL, size=(4.0, 2.0))
-    stage = Stage([small], PlanesConfig(bridge_m=0.0))
+    stage = Stage([small], changed(PlanesConfig(), bridge_m=0.0))
     _, left = stage.show(looking((-1.8, 2.0, 1.2), (-1.8, 3.0, 1.2)))
     _, right = stage.show(looking((1.8, 2.0, 1.2), (1.8, 3.0, 1.2)))
     assert left[0] != right[0]
     seen, both = stage.show(looking((0.0, 0.5, 1.2), (0.0, 3.0, 1.2)))
     assert seen.merged == ((left[0][0], right[0][0]),)
     assert both[0] == left[0]
-    assert stage.registry.resolve(right[0][0]) == left[0][0]
+    assert stage.registry.living(right[0][0]) == left[0][0]
     assert stage.registry.instances[left[0][0]].keyframes == [0, 1, 2]
     _, new = stage.show(looking((0.0, -2.0, 1.2), (0.0, -5.0, 1.0)), rectangles=[replace(WALL, centre=(0, -5, 1.25))])
     assert new[0][0] == right[0][0] + 1  # an id that was absorbed is not given again
 
 
 def test_an_ambiguous_segment_seen_once_is_dropped() -> None:
-    config = PlanesConfig(candidate_keyframes=4)
+    config = changed(PlanesConfig(), candidate_keyframes=4)
     stage = Stage([WALL, FLOOR], config)
     ghost = Rectangle((0.3, 2.0, 1.2), (1, 0, 0), (0, 0, 1), (0.5, 0.5))
     seen, ids = stage.show(HERE, unreliable=(2,), rectangles=[WALL, FLOOR, ghost])
@@ -316,7 +317,7 @@ def test_an_ambiguous_segment_seen_once_is_dropped() -> None:
 
 
 def test_an_ambiguous_segment_that_nothing_confirms_expires() -> None:
-    stage = Stage([WALL, FLOOR], PlanesConfig(candidate_keyframes=4))
+    stage = Stage([WALL, FLOOR], changed(PlanesConfig(), candidate_keyframes=4))
     stage.show(looking((0.0, 1.0, 1.4), (0.0, 3.0, 1.4)), unreliable=(0,))
     assert stage.registry.candidate_count == 1
     for _ in range(5):
@@ -325,7 +326,7 @@ def test_an_ambiguous_segment_that_nothing_confirms_expires() -> None:
 
 
 def test_an_ambiguous_segment_that_comes_again_is_a_plane_from_its_first_keyframe() -> None:
-    stage = Stage([WALL, FLOOR], PlanesConfig(confirm_views=3))
+    stage = Stage([WALL, FLOOR], changed(PlanesConfig(), confirm_views=3))
     found = [stage.show(T_cw, unreliable=(0,)) for T_cw in wandering(3)]
     assert [ids[0] for _, ids in found[:2]] == [[-1], [-1]]
     (plane_id,) = found[2][1][0]
@@ -338,7 +339,7 @@ def test_what_stands_as_a_wall_needs_one_view_less(turn_deg: float, views: int) 
     turn = np.deg2rad(turn_deg)
     along = (-np.sin(turn), np.cos(turn), 0.0)  # seen from the other side than SIDE is, to which it may be parallel
     post = Rectangle((0.2, 2.2, 1.2), along, (0, 0, 1), (0.4, 0.8))
-    stage = Stage([WALL, FLOOR, SIDE, post], PlanesConfig(confirm_views=3))
+    stage = Stage([WALL, FLOOR, SIDE, post], changed(PlanesConfig(), confirm_views=3))
     poses = [looking((x, 0.3, 1.4), (1.4, 3.0, 1.2)) for x in (0.9, 0.95, 1.0)]
     found = [stage.show(T_cw, unreliable=(3,)) for T_cw in poses]
     assert [ids[3][0] >= 0 for _, ids in found] == [view + 1 >= views for view in range(3)]
@@ -362,7 +363,7 @@ def test_what_several_views_see_through_is_removed_and_its_id_not_used_again() -
     removed = [stage.show(T_cw)[0].removed for T_cw in poses[3:8]]
     assert removed.count((gone,)) == 1
     assert removed[0] == removed[1] == ()  # not at the first view that speaks against it
-    assert stage.registry.resolve(gone) == -1
+    assert stage.registry.living(gone) == -1
     assert len(stage.registry.instances) == 3
     _, ids = stage.show(poses[0], rectangles=[*stage.rectangles, board])
     assert ids[3][0] > gone
@@ -399,7 +400,7 @@ def test_planes_follow_when_keyframes_are_moved() -> None:
         wrong[keyframe] = error
         _, ids = stage.show(T_cw, believed=T_cw @ inverse(error))
     before = abs(stage.registry.instances[ids[0][0]].offset_m - 3.0)
-    assert stage.registry.moved({k: inverse(error) for k, error in wrong.items()}) == ()
+    assert stage.registry.move({k: inverse(error) for k, error in wrong.items()}) == ()
     wall = stage.registry.instances[ids[0][0]]
     assert abs(wall.offset_m - 3.0) < min(0.005, before)
     assert_allclose(wall.normal_w, [0, -1, 0], atol=0.003)
@@ -416,12 +417,12 @@ def test_moving_keyframes_back_merges_what_drift_had_parted() -> None:
     _, second = stage.show(HERE, believed=HERE @ inverse(drift))
     assert first[0] != second[0]
     assert first[1] == second[1]  # the floor was not affected
-    assert stage.registry.moved({1: inverse(drift)}) == ((first[0][0], second[0][0]),)
+    assert stage.registry.move({1: inverse(drift)}) == ((first[0][0], second[0][0]),)
     assert len(stage.registry.instances) == 2
 
 
 def test_two_surfaces_that_were_taken_for_one_are_split() -> None:
-    config = PlanesConfig(pose_sigma_m=0.004, step_sigma_m=0.05, max_distance_m=0.3, gate_sigmas=3.0)
+    config = changed(PlanesConfig(), pose_sigma_m=0.004, step_sigma_m=0.05, max_distance_m=0.3, gate_sigmas=3.0)
     stage = Stage([WALL], config)
     near = [replace(WALL, centre=(0.0, 2.94, 1.25))]
     turns = [stage.show(HERE, rectangles=near if turn % 2 else None) for turn in range(10)]
@@ -433,7 +434,7 @@ def test_two_surfaces_that_were_taken_for_one_are_split() -> None:
 
 
 def test_many_views_take_bounded_memory() -> None:
-    stage = Stage([WALL, FLOOR], PlanesConfig(observations=16))
+    stage = Stage([WALL, FLOOR], changed(PlanesConfig(), kept_views=16))
     for _ in range(3):
         for T_cw in wandering(12):
             _, ids = stage.show(T_cw)
@@ -453,7 +454,7 @@ def test_a_view_is_as_certain_as_the_sensor_and_the_surface_that_is_asked_for() 
     exact, rough, as_set = wall.view(0, 0.0), wall.view(0, 0.01), wall.view(0)
     assert exact and rough and as_set
     assert_allclose(rough.covariance[2, 2] - exact.covariance[2, 2], 0.01**2, rtol=1e-9)
-    assert_allclose(as_set.covariance, wall.view(0, PlanesConfig().model_sigma_m).covariance)
+    assert_allclose(as_set.covariance, wall.view(0, PlanesConfig().expert.uncertainty.planarity_sigma_m).covariance)
     assert exact.covariance[2, 2] < 0.001**2  # thousands of pixels: the sensor's noise averages out
     assert_allclose(exact.normal, rough.normal)
     assert stage.registry.seen_from(0, 0.01)[wall.id].covariance[2, 2] == rough.covariance[2, 2]
@@ -482,7 +483,7 @@ def test_what_a_view_parts_stays_in_the_order_in_which_it_was_found() -> None:
     plane = PlaneEstimate(
         np.array([0.0, 0.0, -1.0]), np.asarray(2.0), np.array([0.0, 0.0, 2.0]), np.eye(3)[:2], np.eye(3)
     )
-    joining = Joining(config, Tolerance(config.gate_sigmas, 0.0015, config.pose_sigma_rad, config.pose_sigma_m))
+    joining = Joining(config, Tolerance.of(config, NOISE))
     owner, others = PlanarInstance(plane, config), [PlanarInstance(plane, config) for _ in range(30)]
     for other in others:
         joining.step(owner, other)

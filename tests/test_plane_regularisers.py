@@ -7,6 +7,7 @@ import pytest
 
 from tests.reference import plane_regularisers as reference
 from tests.test_loss_kernels import assert_gradient, central
+from tests.tiers import changed
 from tgslam.config.plane_settings import StructureConfig
 from tgslam.device import runtime
 from tgslam.geometry import matrix_from_quat_wxyz
@@ -15,7 +16,9 @@ from tgslam.ops.plane_regularisers import PlaneRegularisers
 from tgslam.ops.splats import MapGradient
 from tgslam.types import Gaussians
 
-CONFIG = StructureConfig(lambda_str=0.6, omega_flat=1.3, omega_normal=0.8, omega_distance=0.4, sigma_distance_m=0.01)
+CONFIG = changed(
+    StructureConfig(), lambda_str=0.6, omega_flat=1.3, omega_normal=0.8, omega_distance=0.4, sigma_distance_m=0.01
+)
 PARTS = ("flat", "normal", "distance")
 MOVED = ("mean", "log_scale", "quat_wxyz")
 
@@ -131,4 +134,6 @@ def test_descent_flattens_aligns_and_moves_onto_the_plane_what_is_near_it():
     assert abs(reached[near]).max() < 1e-4
     np.testing.assert_allclose(reached[~near], heights[~near], atol=1e-3)  # on another surface
     scales = np.sort(np.exp(device.host("log_scale")), axis=1)
-    np.testing.assert_allclose(scales[:, 0] / np.sqrt(scales[:, 1] * scales[:, 2]), CONFIG.thinness, atol=0.02)
+    np.testing.assert_allclose(
+        scales[:, 0] / np.sqrt(scales[:, 1] * scales[:, 2]), CONFIG.expert.shape.thinness, atol=0.02
+    )

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from tests.plane_views import Rectangle, Stage, looking
-from tgslam.config.plane_settings import PlanesConfig
+from tests.tiers import changed
+from tgslam.config.plane_settings import PlanesConfig, SegmentationSettings
 from tgslam.planes.estimate import PlaneEstimate
 from tgslam.planes.instances.instance import PlanarInstance
 from tgslam.planes.instances.unevenness import is_part
@@ -27,7 +26,7 @@ def instance(plane_id: int, rectangle: Rectangle, turn_rad: float = 0.0, of_m: f
     centre = np.array(rectangle.centre)
     axes = np.stack([np.cross([0.0, 0.0, 1.0], normal), [0.0, 0.0, 1.0]])
     plane = PlaneEstimate(normal, np.asarray(-normal @ centre), centre, axes, np.eye(3) * 1e-8)
-    made = PlanarInstance(plane, replace(PlanesConfig(), cell_m=of_m))
+    made = PlanarInstance(plane, changed(PlanesConfig(), extent_cell_m=of_m))
     made.id = plane_id
     counts = [round(side / of_m) for side in rectangle.size]
     made.support.add(np.argwhere(np.ones(counts)) - np.array(counts) // 2, 0)
@@ -50,17 +49,17 @@ def test_what_is_a_part(small: Rectangle, turn_rad: float, expected: bool) -> No
     wall, other = instance(0, WALL), instance(1, small, turn_rad)
     cells, _ = other.support.cells()
     wall.support.remove(np.unique(wall.support.cells_of(other.support.centres(cells)), axis=0))
-    assert is_part(other, wall, PlanesConfig()) is expected
-    assert not is_part(wall, other, PlanesConfig())
-    assert not is_part(wall, wall, PlanesConfig())
+    assert is_part(other, wall, SegmentationSettings()) is expected
+    assert not is_part(wall, other, SegmentationSettings())
+    assert not is_part(wall, wall, SegmentationSettings())
 
 
 def test_a_candidate_has_no_parts() -> None:
-    assert not is_part(instance(1, standing_off(0.006)), instance(-1, WALL), PlanesConfig())
+    assert not is_part(instance(1, standing_off(0.006)), instance(-1, WALL), SegmentationSettings())
 
 
 # Segments of truly exact planes, which the registry then tells apart at less than a centimetre
-TOLD_APART = PlanesConfig(model_sigma_m=0.0002)
+TOLD_APART = changed(PlanesConfig(), planarity_sigma_m=0.0002)
 
 
 def test_a_buckle_goes_by_its_surfaces_id() -> None:
@@ -89,14 +88,14 @@ def test_an_instance_that_turns_out_to_be_a_part_gives_up_its_id() -> None:
     for T_cw in VIEWS:
         _, ids = stage.show(T_cw)
     assert ids[0] == ids[1] != [part]
-    assert stage.registry.resolve(part) == ids[0][0]
+    assert stage.registry.living(part) == ids[0][0]
 
 
 def test_a_part_of_what_is_no_more_counts_again() -> None:
     stage = Stage([WALL, standing_off(0.008)], TOLD_APART)
     for T_cw in VIEWS:
         stage.show(T_cw)
-    for _ in range(2 * TOLD_APART.through_keyframes):  # the wall has gone, which the view sees through
+    for _ in range(2 * TOLD_APART.expert.lifetime.through_keyframes):  # the wall has gone, which the view sees through
         for T_cw in VIEWS:
             _, ids = stage.show(T_cw, rectangles=[standing_off(-1.0, (4.0, 4.0)), standing_off(0.008)])
     (part,) = ids[1]

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tgslam.camera import SensorNoise
+from tests.reference.palette import ids_of
+from tests.tiers import changed
 from tgslam.config.input_settings import SyntheticConfig
 from tgslam.config.map_settings import LossConfig, MappingConfig, SeedingConfig
-from tgslam.config.plane_settings import PlanesConfig, StructureConfig
+from tgslam.config.plane_settings import StructureConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.device import runtime
 from tgslam.geometry import inverse
@@ -19,10 +20,8 @@ from tgslam.map.keyframes import Keyframe
 from tgslam.mapping.insertion import quadtree, seed
 from tgslam.mapping.refinement import Refiner
 from tgslam.mapping.structure_terms import StructureTerms
-from tgslam.planes.identity import palette
 from tgslam.planes.identity.codes import codes_of, initial_theta, read_ids
 from tgslam.planes.instances.plane_table import PlaneTable
-from tgslam.planes.instances.registry import PlaneRegistry
 from tgslam.types import Exposure
 
 CONFIG = StructureConfig()
@@ -99,7 +98,7 @@ def test_without_planes_in_sight_nothing_changes_to_the_bit(source: SyntheticSou
 def test_embeddings_learn_the_planes(source: SyntheticSource) -> None:
     start = share_wrong(source, *refined(source, CONFIG, 0))
     first = share_wrong(source, *refined(source, CONFIG, 1))
-    later = share_wrong(source, *refined(source, replace(CONFIG, pgi_interval=1), 12))
+    later = share_wrong(source, *refined(source, changed(CONFIG, pgi_interval=1), 12))
     assert start > 0.9
     assert first < 0.4
     assert later < 0.2
@@ -119,7 +118,7 @@ def test_gaussians_go_to_their_planes(source: SyntheticSource) -> None:
 
 
 def test_embeddings_take_part_in_every_nth_step_of_a_keyframe(source: SyntheticSource) -> None:
-    terms = StructureTerms(source.camera, replace(CONFIG, pgi_interval=3), 8)
+    terms = StructureTerms(source.camera, changed(CONFIG, pgi_interval=3), 8)
     first, second = (true_keyframe(source, index) for index in VIEWS)
     assert [terms.due(first) is not None for _ in range(7)] == [True, False, False, True, False, False, True]
     assert terms.due(second) is not None
@@ -127,7 +126,7 @@ def test_embeddings_take_part_in_every_nth_step_of_a_keyframe(source: SyntheticS
 
 
 def test_a_keyframe_with_new_ids_is_prepared_anew(source: SyntheticSource) -> None:
-    terms, view = StructureTerms(source.camera, replace(CONFIG, pgi_interval=1), 8), true_keyframe(source, 0)
+    terms, view = StructureTerms(source.camera, changed(CONFIG, pgi_interval=1), 8), true_keyframe(source, 0)
     before, again = terms.due(view), terms.due(view)
     assert before is again
     change_ids(view)
@@ -136,7 +135,7 @@ def test_a_keyframe_with_new_ids_is_prepared_anew(source: SyntheticSource) -> No
 
 def test_a_keyframe_with_new_ids_takes_part_in_its_next_refinement(source: SyntheticSource) -> None:
     terms, view, other = (
-        StructureTerms(source.camera, replace(CONFIG, pgi_interval=3), 8),
+        StructureTerms(source.camera, changed(CONFIG, pgi_interval=3), 8),
         true_keyframe(source, 0),
         true_keyframe(source, VIEWS[1]),
     )
@@ -161,12 +160,14 @@ def taken_over(source: SyntheticSource, config: StructureConfig, plane: int) -> 
     for view in (true_keyframe(source, 0), blind, blind):
         refiner.step(view)
     colours = 1.0 / (1.0 + np.exp(-gaussians.host("embedding")[gaussians.host("plane_id") == plane]))
-    return float(np.mean(palette.ids_of(colours, np.unique(labels[labels >= 0]), CONFIG.read_margin) != plane))
+    return float(np.mean(ids_of(colours, np.unique(labels[labels >= 0]), CONFIG.expert.reading.read_margin) != plane))
 
 
 def test_a_view_that_shows_only_the_fringe_of_a_plane_takes_less_of_it_over(source: SyntheticSource) -> None:
-    config = replace(CONFIG, pgi_interval=1)
-    damped, undamped = (taken_over(source, replace(config, fringe_share=s), 1) for s in (config.fringe_share, 0.0))
+    config = changed(CONFIG, pgi_interval=1)
+    damped, undamped = (
+        taken_over(source, changed(config, fringe_share=s), 1) for s in (config.expert.embedding.fringe_share, 0.0)
+    )
     assert undamped > 0.15
     assert damped < 0.7 * undamped
 
@@ -190,6 +191,6 @@ def test_absorbed_planes_look_like_their_survivors_and_removed_ones_like_none(so
 
 
 def test_the_table_of_a_registry_without_planes_is_empty_of_them() -> None:
-    table = PlaneTable.of(PlaneRegistry(PlanesConfig(), SensorNoise(0.0015), {}), 3)
+    table = PlaneTable.of({}, np.full(3, -1, np.int32))
     np.testing.assert_array_equal(table.ids, [-1, -1, -1])
     assert not table.planes_w.any()

@@ -18,7 +18,7 @@ def weights(ids, depth, config):
         steps = [(y, x) for y in (-EDGE_PX, 0, EDGE_PX) for x in (-EDGE_PX, 0, EDGE_PX)]
         around = [(np.clip(i + y, 0, height - 1), np.clip(j + x, 0, width - 1)) for y, x in steps]
         edge = any(depth[at] > 0 and ids[at] != ids[i, j] for at in around)
-        out[i, j] = (1.0 if ids[i, j] >= 0 else config.weight_none) * (1.0 + config.edge_boost * edge)
+        out[i, j] = (1.0 if ids[i, j] >= 0 else config.no_plane_weight) * (1.0 + config.edge_boost * edge)
     return out
 
 
@@ -27,7 +27,7 @@ def value(embedding, opacity, ids, weight, codes, config):
     wanted = codes[np.where(ids + 1 < len(codes), ids + 1, 0)]
     residual = np.linalg.norm(embedding - opacity[..., None] * wanted, axis=-1)
     counted = (weight > 0).sum()
-    total = (weight * charbonnier(residual, config.charbonnier_pgi)).sum()
+    total = (weight * charbonnier(residual, config.expert.embedding.charbonnier_pgi)).sum()
     return config.lambda_pgi * total / counted if counted else 0.0
 
 

@@ -30,9 +30,9 @@ def parts(mean, log_scale, quat, areas, use, plane_id, planes, config):
         axis = matrix_from_quat_wxyz(quat[i] / np.linalg.norm(quat[i]))[:, np.argmin(log_scale[i])]
         normal, offset = planes[plane_id[i], :3], planes[plane_id[i], 3]
         sums += (
-            (s3 - config.thinness * np.sqrt(s1 * s2)) ** 2 / areas[i],
+            (s3 - config.expert.shape.thinness * np.sqrt(s1 * s2)) ** 2 / areas[i],
             1 - abs(axis @ normal),
-            geman_mcclure((normal @ mean[i] + offset) / config.sigma_distance_m),
+            geman_mcclure((normal @ mean[i] + offset) / config.expert.shape.sigma_distance_m),
         )
     return dict(zip(("flat", "normal", "distance"), sums / max(use.sum(), 1), strict=True))
 

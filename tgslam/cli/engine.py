@@ -57,7 +57,7 @@ def make_read_ids(camera: Camera, planes: Sequence[Plane], config: Config) -> Re
     from tgslam.planes.identity.reading import PlaneReader
 
     rasterizer = Rasterizer(camera)
-    reader = PlaneReader(camera, planes, config.structure, config.loss.depth_sigma_per_m2)
+    reader = PlaneReader(camera, planes, config.structure, config.loss.noise)
 
     def read(gaussians: Gaussians, T_cw: Matrix4) -> NDArray[np.int32]:
         images = rasterizer.forward(FixedSplats.of(gaussians), T_cw, with_embedding=True)

@@ -1,4 +1,4 @@
-"""Settings of the map: how it is seeded, refined, and held to planes, and under which objective."""
+"""Settings of the map: how it is seeded and refined, and under which objective."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class KnownExtents:
         A view leaves out what is small, far or at a bad angle; other views know it, and it still is no empty space.
         """
         pixels, points = self._measured(ids == NO_ID)
-        least = np.full(len(pixels), self._config.gate_sigmas**2)
+        least = np.full(len(pixels), self._config.expert.association.gate_sigmas**2)
         found = np.full(len(pixels), NO_ID, np.int32)
         for instance in self._in_view():
             squares = self._squared_sigmas(instance, points)
@@ -82,5 +82,5 @@ class KnownExtents:
         offset_m = instance.offset_m + float(instance.normal_w @ self._T_wc[:3, 3])
         along = normal[0] * points[0] + normal[1] * points[1] + normal[2] * points[2]
         sigma_m = self._noise.per_m2 * points[2] * along
-        result: Points = (along + offset_m) ** 2 / (sigma_m**2 + self._config.model_sigma_m**2)
+        result: Points = (along + offset_m) ** 2 / (sigma_m**2 + self._config.expert.uncertainty.planarity_sigma_m**2)
         return result

@@ -38,7 +38,7 @@ class PlaneObserver:
         """Match the latest keyframe's planes to the PGIs; it and earlier ones show what comes of that."""
         registry, number = _registry_of(world), len(world.keyframes) - 1
         keyframe, depth_m = world.keyframes[number], world.keyframes.images(number).depth_m
-        view = extract_planes(runtime.to_device(depth_m), self._camera, self._config, self._noise.per_m2)
+        view = extract_planes(runtime.to_device(depth_m), self._camera, self._config, self._noise)
         view = registry.with_known_steps(view, depth_m, self._camera, keyframe.T_cw)
         observation = registry.observe(view, depth_m, self._camera, keyframe.T_cw, number)
         for earlier in world.keyframes[:-1]:
@@ -133,7 +133,9 @@ class PlaneObserver:
             normal = T_cw[:3, :3] @ instance.normal_w
             offset_m = instance.offset_m - normal @ T_cw[:3, 3]
             z = -offset_m / np.minimum(self._rays.reshape(-1, 3)[at] @ normal, -1e-6)
-            agrees = np.abs(z - measured) < _AGREEMENT * (self._noise.sigma_m(z) + self._config.model_sigma_m)
+            agrees = np.abs(z - measured) < _AGREEMENT * (
+                self._noise.sigma_m(z) + self._config.expert.uncertainty.planarity_sigma_m
+            )
             agrees |= measured <= 0
             on = at[agrees]
             depth_m.ravel()[on], kept.ravel()[on] = z[agrees], plane_id

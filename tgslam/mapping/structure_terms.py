@@ -53,7 +53,8 @@ class StructureTerms:
         known, visit = self._visits.get(keyframe.index, (version, 0))
         visit = visit if known == version else 0
         self._visits[keyframe.index] = version, visit + 1
-        return self._target(keyframe, keyframe.labels) if visit % self.config.pgi_interval == 0 else None
+        is_due = visit % self.config.expert.embedding.pgi_interval == 0
+        return self._target(keyframe, keyframe.labels) if is_due else None
 
     def pgi(self, rendered: RenderImages, target: InstanceTarget, g_opacity: np.ndarray) -> InstanceGradient:
         """E_pgi at a rendering; its derivative by opacity is added to g_opacity [H, W]."""
@@ -88,7 +89,10 @@ class StructureTerms:
         known = self._targets.pop(keyframe.index, None)
         if known is None or known[0] != keyframe.label_version:
             depth_m = runtime.to_device(keyframe.depth_m())
-            known = keyframe.label_version, instance_field.prepare(labels.image(), depth_m, self.config)
+            known = (
+                keyframe.label_version,
+                instance_field.prepare(labels.image(), depth_m, self.config.expert.embedding),
+            )
         self._targets[keyframe.index] = known
         while len(self._targets) > self._kept_targets:
             self._targets.popitem(last=False)

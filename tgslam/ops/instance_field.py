@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tgslam.config.plane_settings import StructureConfig
+from tgslam.config.plane_settings import InstanceFieldSettings, StructureConfig
 from tgslam.device import runtime
 from tgslam.device.arrays import require
 from tgslam.kernels import instance_field as kernels
@@ -57,20 +57,20 @@ class Workspace:
         self.partial = partial_sums(1, width, height)
 
 
-def prepare(ids: ArrayLike, depth_m: np.ndarray, config: StructureConfig) -> InstanceTarget:
+def prepare(ids: ArrayLike, depth_m: np.ndarray, config: InstanceFieldSettings) -> InstanceTarget:
     """A keyframe's target and the weights of Eq. 4.
 
     ids: integers [H, W] on the host, -1 = on no plane. depth_m: device array float32 [H, W], 0 = none. A pixel on a
     plane weighs 1; 1 + edge_boost within 2 px of another plane, so that boundaries stay sharp although they are few.
     Boundaries are those of the ids: texture on a plane is none. A measured pixel on no plane should be black, or what
-    stands before a plane would take its identity; it weighs weight_none, since one view's extraction leaves out what
-    other views find. A pixel without depth has no label to trust, and weighs nothing.
+    stands before a plane would take its identity; it weighs `no_plane_weight`, since one view's extraction leaves out
+    what other views find. A pixel without depth has no label to trust, and weighs nothing.
     """
     on_device = runtime.to_device(np.asarray(ids, np.int32), np.int32)
     height, width = require("ids", on_device, (None, None), np.int32).shape
     require("depth_m", depth_m, (height, width))
     weight, counted, partial = runtime.empty((height, width)), runtime.empty((1,)), partial_sums(1, width, height)
-    kernels.weigh_ids(on_device, depth_m, config.edge_boost, config.weight_none, weight, partial)
+    kernels.weigh_ids(on_device, depth_m, config.edge_boost, config.no_plane_weight, weight, partial)
     add_up(partial, counted)
     return InstanceTarget(on_device, weight, counted)
 
@@ -97,7 +97,7 @@ def pgi_loss(
         require(name, image, (height, width))
     kernels.pgi_slopes(
         embedding, opacity, target.ids, target.weight, target.counted, codes,
-        config.lambda_pgi, config.charbonnier_pgi,
+        config.lambda_pgi, config.expert.embedding.charbonnier_pgi,
         workspace.embedding, g_opacity, workspace.weight, workspace.partial,
     )  # fmt: skip
     add_up(workspace.partial, workspace.penalties)
@@ -122,8 +122,8 @@ def relax(
     reach into measured pixels, they are beyond the edge: it moves little. The step does not depend on lambda_pgi.
     """
     kernels.relax_embeddings(
-        count, visible, grad_theta, curvature, target.counted, most_px, config.relaxation,
-        _ONE_PIXEL * config.lambda_pgi, config.fringe_share, theta,
+        count, visible, grad_theta, curvature, target.counted, most_px, config.expert.embedding.embedding_relaxation,
+        _ONE_PIXEL * config.lambda_pgi, config.expert.embedding.fringe_share, theta,
     )  # fmt: skip
 
 

@@ -74,7 +74,7 @@ class PixelLabels:
     def __init__(self, depth_m: np.ndarray, grid: CellGrid, cell_labels: Labels) -> None:
         """depth_m: device [H, W] m, 0 = none. cell_labels: [rows, columns] plane of each cell, -1 = none."""
         camera = grid.camera
-        require("depth_m", depth_m, (camera.height, camera.width))
+        require("depth_m", depth_m, camera.shape)
         self._inverse = runtime.empty(depth_m.shape)
         kernels.inverse_depth(depth_m, SPLIT, self._inverse)
         self._grid = grid
@@ -124,7 +124,7 @@ def cell_moments(depth_m: np.ndarray, grid: CellGrid) -> tuple[Floats, Floats]:
 
     depth_m: device [H, W] m, 0 = none. The noise is told from 2 x 2 pixels, whose twist no plane has; 0 without any.
     """
-    require("depth_m", depth_m, (grid.camera.height, grid.camera.width))
+    require("depth_m", depth_m, grid.camera.shape)
     moments, reference = runtime.empty((len(grid), kernels.MOMENTS)), runtime.empty((len(grid),))
     twist = runtime.empty((len(grid), 2))
     kernels.cell_moments(depth_m, grid.cell_px, grid.shape[1], moments, reference, twist)

@@ -47,7 +47,7 @@ class PlaneRegularisers:
             gaussians.mean, gaussians.log_scale, gaussians.quat_wxyz,
             config.lambda_str * config.omega_flat, config.lambda_str * config.omega_normal,
             config.lambda_str * config.omega_distance,
-            config.thinness, config.sigma_distance_m, self._counted,
+            config.expert.shape.thinness, config.expert.shape.sigma_distance_m, self._counted,
             into.mean, into.log_scale, into.quat_wxyz, self._partial,
         )  # fmt: skip
 

@@ -19,7 +19,7 @@ from tgslam.planes.segment import PlaneSegment
 
 Vector = NDArray[np.float64]
 _HUBER_DEVIATION = 2.0  # sigmas from which a view of a plane counts less and less
-_ROBUST_STEPS = 3
+_ROBUST_STEPS = 3  # of weighting anew, at most
 
 
 @dataclass(frozen=True)

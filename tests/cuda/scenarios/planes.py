@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tests.cuda.harness import scenario
-from tgslam.camera import Camera
+from tgslam.camera import Camera, SensorNoise
 from tgslam.config.plane_settings import PlanesConfig
 from tgslam.device import runtime
 from tgslam.planes.segmentation.extraction import extract_planes
@@ -24,7 +24,7 @@ def extraction(height: int = 61, width: int = 90) -> dict[str, np.ndarray]:
     inverse[:40, 60:66] = 0.9
     depth_m = 1.0 / (inverse + _SIGMA_PER_M2 * rng.normal(size=inverse.shape))
     depth_m[rng.random(depth_m.shape) < 0.05] = 0.0
-    view = extract_planes(runtime.to_device(depth_m), camera, PlanesConfig(), _SIGMA_PER_M2)
+    view = extract_planes(runtime.to_device(depth_m), camera, PlanesConfig(), SensorNoise(_SIGMA_PER_M2))
     segments = view.segments
     return {
         "labels": view.labels,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tests.cuda.harness import scenario
+from tests.tiers import changed
 from tgslam.camera import Camera
 from tgslam.config.input_settings import SyntheticConfig
 from tgslam.config.map_settings import LossConfig, MappingConfig
@@ -70,7 +71,7 @@ def steps(optimizer: str = "relaxation", steps: int = 3, planes: bool = False) -
     source = SyntheticSource(SyntheticConfig(scene="room", width=64, height=48, frames=720), seed=0)
     frame = source.read(0)
     gaussians = GaussianMap.from_gaussians(_facing(frame, source.camera))
-    structure = StructureConfig(pgi_interval=2) if planes else None
+    structure = changed(StructureConfig(), pgi_interval=2) if planes else None
     refiner = Refiner(gaussians, source.camera, MappingConfig(optimizer=optimizer), LossConfig(), structure)
     pose = se3_exp([0.002, -0.001, 0.001, 0.003, 0.002, -0.004])
     keyframe, adam = Keyframe(frame, pose, Exposure(1.1, 0.02), np.eye(6)), VectorAdam([0.0003] * 6)

@@ -38,7 +38,7 @@ def relaxed(count: int = 300) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
     theta = runtime.to_device(2.0 * rng.normal(size=(count, 3)))
     _, ids, depth, _ = field_scene(9, 33)
-    target = instance_field.prepare(ids, runtime.to_device(depth), CONFIG)
+    target = instance_field.prepare(ids, runtime.to_device(depth), CONFIG.expert.embedding)
     visible = runtime.to_device(rng.integers(0, 3, count), np.int32)
     gradient, curvature = 0.01 * rng.normal(size=(count, 3)), 10.0 ** rng.uniform(-3, 0, (count, 2))
     most_px = runtime.to_device(10.0 ** rng.uniform(-1, 2, count))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tgslam.bench.workloads import back_projected
 from tgslam.camera import Camera
 from tgslam.config.input_settings import SyntheticConfig
-from tgslam.config.plane_settings import StructureConfig
+from tgslam.config.plane_settings import InstanceFieldSettings, ReadingSettings, StructureConfig, StructureExpert
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.device import runtime
 from tgslam.map.gaussians import GaussianMap
@@ -69,11 +69,17 @@ def measure(
     curves, gaussians = [], 0
     for identity in IDENTITIES:
         progress(identity)
-        config = StructureConfig(identity=identity, scalar_ids=planes, read_margin=0.0)
+        config = _config(identity, planes)
         learning = _Learning(source.camera, frame, ids, config)
         curves.append(_learn(learning, identity, ids, frame.depth_m > 0))
         gaussians = learning.gaussians
     return Ablation(scene, index, size, planes, gaussians, curves, palette.colours(ids))
+
+
+def _config(identity: str, planes: int) -> StructureConfig:
+    """Of a study with so many planes: each scalar is theirs, and the nearest code counts however near the next is."""
+    embedding, reading = InstanceFieldSettings(scalar_ids=planes), ReadingSettings(read_margin=0.0)
+    return StructureConfig(identity=identity, expert=StructureExpert(embedding=embedding, reading=reading))
 
 
 def picture(found: Ablation) -> FloatImage:
@@ -106,13 +112,13 @@ class _Learning:
         self._codes = runtime.to_device(code_table(np.arange(self._known.max(initial=-1) + 1), config))
         self._map = GaussianMap.from_gaussians(back_projected(frame, camera, _STRIDE))
         self._rasterizer = Rasterizer(camera)
-        self._workspace = instance_field.Workspace(*camera.shape)
-        self._target = instance_field.prepare(ids, runtime.to_device(frame.depth_m), config)
+        self._workspace = instance_field.Workspace(camera.height, camera.width)
+        self._target = instance_field.prepare(ids, runtime.to_device(frame.depth_m), config.expert.embedding)
         self._gradient = MapGradient.zeros(self._map.capacity)
         self._most_px = runtime.zeros((self._map.capacity,))  # it is the only view
-        self._g_opacity = runtime.zeros(camera.shape)
-        self._no_colour = runtime.zeros((*camera.shape, 3))
-        self._no_depth = runtime.zeros(camera.shape)
+        self._g_opacity = runtime.zeros((camera.height, camera.width))
+        self._no_colour = runtime.zeros((camera.height, camera.width, 3))
+        self._no_depth = runtime.zeros((camera.height, camera.width))
 
     @property
     def gaussians(self) -> int:

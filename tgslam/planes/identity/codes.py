@@ -9,8 +9,7 @@ from tgslam.config.plane_settings import StructureConfig
 from tgslam.ops import instance_field
 from tgslam.planes.identity import palette
 
-_LEAST, _MOST = 0.04, 0.96  # what a sigmoid (Eq. 1) reaches without saturating
-_NEAR_MARGINS = 2.0  # of reading: so near has to be a mixture
+_NEAR_MARGINS = 2.0  # of reading: so near has to be a mixture, each end of which may be off by one
 _NEUTRAL = 0.5  # what embeddings of 0 show: channels that carry nothing never move
 
 
@@ -23,8 +22,8 @@ def codes_of(ids: ArrayLike, config: StructureConfig) -> NDArray[np.float32]:
     """
     if config.identity == "colour":
         return palette.colours(ids)
-    steps = np.clip((np.asarray(ids, np.float64) + 1.0) / config.scalar_ids, 0.0, 1.0)
-    first = _LEAST + (_MOST - _LEAST) * steps
+    steps = np.clip((np.asarray(ids, np.float64) + 1.0) / config.expert.embedding.scalar_ids, 0.0, 1.0)
+    first = palette.LEAST + (palette.MOST - palette.LEAST) * steps
     return np.stack([first, np.full_like(first, _NEUTRAL), np.full_like(first, _NEUTRAL)], axis=-1).astype(np.float32)
 
 
@@ -46,7 +45,8 @@ def read_ids(
     The nearest code is the rounded scalar where ids are scalars; the margin then is that share of a step.
     """
     ids = np.append(palette.NO_PLANE, np.asarray(known_ids, np.int64))
-    return instance_field.read_ids(embedding, opacity, ids, codes_of(ids, config), _margin(config), config.read_opacity)
+    min_opacity = config.expert.reading.read_opacity
+    return instance_field.read_ids(embedding, opacity, ids, codes_of(ids, config), _margin(config), min_opacity)
 
 
 def unmixed(colours: NDArray[np.floating], ids: NDArray[np.integer], config: StructureConfig) -> NDArray[np.int32]:
@@ -69,5 +69,5 @@ def unmixed(colours: NDArray[np.floating], ids: NDArray[np.integer], config: Str
 
 def _margin(config: StructureConfig) -> float:
     if config.identity == "colour":
-        return config.read_margin
-    return config.read_margin * (_MOST - _LEAST) / config.scalar_ids
+        return config.expert.reading.read_margin
+    return config.expert.reading.read_margin * (palette.MOST - palette.LEAST) / config.expert.embedding.scalar_ids

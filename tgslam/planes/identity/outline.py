@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from tgslam.geometry import tangent_axes
 from tgslam.types import Plane
 
-_STEPS = 3  # of the grid in the margin
-_MAX_SIDE = 2048  # of the grid: larger planes get a coarser one
+_STEPS = 3  # of the grid in the margin: borders are known to a sixth of it
+_MAX_SIDE = 2048  # of the grid, so that it takes 4 MiB at most: larger planes get a coarser one
 
 
 class Outline:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.camera import Camera
+from tgslam.camera import Camera, SensorNoise
 from tgslam.config.plane_settings import StructureConfig
 from tgslam.device import runtime
 from tgslam.geometry import inverse, transform_points
@@ -18,7 +18,7 @@ from tgslam.planes.identity.outline import Outline
 from tgslam.planes.instances.instance import NO_ID
 from tgslam.types import FloatImage, Matrix4, Plane
 
-_AROUND = tuple((dy, dx) for dy in (-2, 0, 2) for dx in (-2, 0, 2) if dy or dx)  # px
+_AROUND = tuple((dy, dx) for dy in (-2, 0, 2) for dx in (-2, 0, 2) if dy or dx)  # px: beyond a blurred edge
 
 
 class PlaneReader:
@@ -29,13 +29,11 @@ class PlaneReader:
     held against mixtures of what the pixels around show.
     """
 
-    def __init__(
-        self, camera: Camera, planes: Sequence[Plane], config: StructureConfig, depth_sigma_per_m2: float
-    ) -> None:
-        """depth_sigma_per_m2: the sensor's noise, sigma_z = this * z^2, m."""
-        self.config, self.sigma_per_m2 = config, depth_sigma_per_m2
+    def __init__(self, camera: Camera, planes: Sequence[Plane], config: StructureConfig, noise: SensorNoise) -> None:
+        """noise: the depth sensor's."""
+        self.config, self.noise = config, noise
         self.planes = sorted(planes, key=lambda plane: plane.id)
-        self._outlines = [Outline(plane, config.read_margin_m) for plane in self.planes]
+        self._outlines = [Outline(plane, config.expert.reading.read_margin_m) for plane in self.planes]
         self._rays = camera.rays()
 
     def read(self, images: RenderImages, T_cw: Matrix4) -> NDArray[np.int32]:
@@ -45,7 +43,7 @@ class PlaneReader:
         depth_m = runtime.to_host(images.depth) / opacity
         ids = self.on_planes(ids, depth_m, T_cw)
         colours = runtime.to_host(images.embedding) / opacity[..., None]
-        mixed = self._unmixed(ids, colours, opacity >= self.config.read_opacity)
+        mixed = self._unmixed(ids, colours, opacity >= self.config.expert.reading.read_opacity)
         return self.on_planes(mixed, depth_m, T_cw)
 
     def _unmixed(self, ids: NDArray[np.int32], colours: FloatImage, covered: NDArray[np.bool_]) -> NDArray[np.int32]:
@@ -69,13 +67,13 @@ class PlaneReader:
 
         Nor have connected pixels an id if none of them is where that plane has been seen.
         """
-        result, T_wc = np.full_like(ids, NO_ID), inverse(T_cw)
+        result, T_wc, limits = np.full_like(ids, NO_ID), inverse(T_cw), self.config.expert.reading
         for plane, outline in zip(self.planes, self._outlines, strict=True):
             at = np.nonzero(ids == plane.id)
             normal = T_cw[:3, :3] @ plane.normal_w
             z = depth_m[at].astype(np.float64)
             distance = np.abs(z * (self._rays[at] @ normal) + plane.offset_m - normal @ T_cw[:3, 3])
-            near = distance <= self.config.read_distance_m + self.config.read_sigmas * self.sigma_per_m2 * z**2
+            near = distance <= limits.read_distance_m + limits.read_sigmas * self.noise.per_m2 * z**2
             rows, columns = at[0][near], at[1][near]
             seen = outline.holds(transform_points(T_wc, self._rays[rows, columns] * z[near, None]))
             if not seen.all():

@@ -61,7 +61,7 @@ def gate(planes: PlaneEstimate, references: PlaneEstimate, position: Vector, con
     distance = np.abs(references.heights_m(planes.centroid))
     deviation = deviation_sigmas(planes, references)
     admitted = (angle <= config.max_angle_rad) & (distance <= config.max_distance_m)
-    admitted &= deviation <= config.gate_sigmas
+    admitted &= deviation <= config.expert.association.gate_sigmas
     return Agreement(angle, np.abs(own_m - reference_m) / largest, deviation, admitted)
 
 
@@ -94,13 +94,11 @@ def matching_cost(agreement: Agreement, iou: Vector, config: PlanesConfig) -> Ve
     The middle term is at most w_d, and at least w_d times the share of its gate that the deviation takes: surfaces
     a few centimetres apart differ little in Delta d.
     """
-    metric = agreement.deviation_sigmas / config.gate_sigmas
-    offset = np.minimum(np.maximum(agreement.offset_ratio / config.max_offset_ratio, metric), 1.0)
-    return (
-        config.weight_angle * agreement.angle_rad / config.max_angle_rad
-        + config.weight_offset * offset
-        + config.weight_overlap * (1.0 - iou)
-    )
+    limits = config.expert.association
+    metric = agreement.deviation_sigmas / limits.gate_sigmas
+    offset = np.minimum(np.maximum(agreement.offset_ratio / limits.max_offset_ratio, metric), 1.0)
+    w_theta, w_d, w_o = config.matching_weights
+    return w_theta * agreement.angle_rad / config.max_angle_rad + w_d * offset + w_o * (1.0 - iou)
 
 
 def assign(cost: Vector, allowed: Mask) -> list[tuple[int, int]]:

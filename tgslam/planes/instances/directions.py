@@ -16,9 +16,9 @@ def stands_as_known(instance: PlanarInstance, known: Iterable[PlanarInstance], c
     What only looks like a plane, such as a strip of a round surface or one that two others share, may be turned any
     way: within two degrees of one of three walls, one of some five hundred of them is by chance.
     """
-    allowed_rad = config.gate_sigmas * config.reliable_angle_rad
+    allowed_rad = config.expert.association.gate_sigmas * config.expert.reliability.reliable_angle_rad
     return any(
         np.linalg.norm(np.cross(instance.normal_w, other.normal_w)) <= allowed_rad
         for other in known
-        if other is not instance and other.id != NO_ID and other.area_m2 >= config.across_area_m2
+        if other is not instance and other.id != NO_ID and other.area_m2 >= config.expert.gaps.across_area_m2
     )

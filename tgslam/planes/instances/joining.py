@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from tgslam.config.plane_settings import PlanesConfig
 from tgslam.planes.estimate import offset_sigmas, stacked
 from tgslam.planes.instances.association import gate
+from tgslam.planes.instances.gaps import Gap, adjoins, gap_between, shortest_gap
 from tgslam.planes.instances.instance import NO_ID, PlanarInstance
-from tgslam.planes.instances.matching import LEAST_SAMPLES, WELL, ViewMatching, adjoins, coplanar_in_views, shortest_gap
-from tgslam.planes.instances.sight import Gap, Samples, Tolerance, gap_between
+from tgslam.planes.instances.matching import LEAST_SAMPLES, WELL, ViewMatching, coplanar_in_views
+from tgslam.planes.instances.sight import Samples, Tolerance
 
-_MOST = 0.5
+_MOST = 0.5  # of an extent, that lies in another one
 _TAKEN_SHARE = 0.8  # of what a view shows of a surface, that it counts to another one
 _BEHIND_SHARE = 0.02  # of all surfaces, that errors may put behind a plane that bounds the scene
 
@@ -26,6 +27,7 @@ class Joining:
 
     def __init__(self, config: PlanesConfig, tolerance: Tolerance) -> None:
         self._config, self._tolerance = config, tolerance
+        self._gate_sigmas, self._gaps = config.expert.association.gate_sigmas, config.expert.gaps
         # Coplanar pairs between which a view looks through, in the order in which they were found: that of a set would
         # be by address, and differ from run to run
         self._apart: dict[frozenset[PlanarInstance], None] = {}
@@ -76,11 +78,11 @@ class Joining:
         """An instance out of `touched`, and another one, that are the same surface. samples: of the latest view."""
         if not touched:
             return None
-        config = self._config
+        error = self._config.expert.uncertainty
         ours = stacked([i.plane for i in touched])[:, None]
-        theirs = stacked([i.plane for i in everything])[None].widened(config.pose_sigma_rad, config.pose_sigma_m)
+        theirs = stacked([i.plane for i in everything])[None].widened(error.pose_sigma_rad, error.pose_sigma_m)
         origin = np.zeros(3)  # decides on offset ratios only, which are not used here
-        forth, back = gate(theirs, ours, origin, config), gate(ours, theirs, origin, config)
+        forth, back = (gate(*pair, origin, self._config) for pair in ((theirs, ours), (ours, theirs)))
         sigmas = np.maximum(forth.deviation_sigmas, back.deviation_sigmas)
         refused: set[frozenset[PlanarInstance]] = set()  # pairs that come again the other way round
         for i, j in np.argwhere(forth.admitted & back.admitted):
@@ -89,7 +91,7 @@ class Joining:
             if a is b or pair in refused:
                 continue
             in_views = coplanar_in_views(a, b)
-            if in_views is None or in_views <= config.gate_sigmas:
+            if in_views is None or in_views <= self._gate_sigmas:
                 bounding = self._bounds(a, b, everything)
                 coplanar = in_views is not None or self._coplanar(a, b, float(sigmas[i, j]), bounding)
                 if coplanar and self._joined(a, b, bounding, samples):
@@ -101,7 +103,7 @@ class Joining:
         """Two that no view shows both, and which deviate by `sigmas` in the world: by at most half the gate unless they
         bound the scene, or the extent of one lies for the most part in that of the other.
         """
-        if bounding or sigmas <= WELL * self._config.gate_sigmas:
+        if bounding or sigmas <= WELL * self._gate_sigmas:
             return True
         large, cells = _on_larger(a, b)
         return float(np.mean(large.support.holds(cells))) > _MOST
@@ -114,22 +116,22 @@ class Joining:
         as walls do over a door, or where most views show that nothing stands in it.
         """
         large, cells = _on_larger(a, b)
-        longest_m = np.inf if bounding else self._config.bridge_m
+        longest_m = np.inf if bounding else self._gaps.bridge_m
         ways = shortest_gap(large.support, cells, longest_m)
         gap = Gap(False, False, False)
         if ways is not None and samples is not None:
-            gap = gap_between(samples, *ways, large.plane, self._tolerance)
+            gap = gap_between(samples, ways, large.plane, self._tolerance, self._gaps.close_before_m)
         self._look(a, b, gap)
-        if gap.parts(max(a.area_m2, b.area_m2), self._config):
+        if gap.parts(max(a.area_m2, b.area_m2), self._gaps):
             return False
         if frozenset((a, b)) in self._apart:
             touching = adjoins(large.support.near(cells, 0.0))
-            return touching and min(a.area_m2, b.area_m2) >= self._config.across_area_m2
-        if bounding or adjoins(large.support.near(cells, self._config.max_gap_m)):
+            return touching and min(a.area_m2, b.area_m2) >= self._gaps.across_area_m2
+        if bounding or adjoins(large.support.near(cells, self._gaps.max_gap_m)):
             return True
         if ways is None or samples is None:
             return False
-        return gap.hidden or min(a.area_m2, b.area_m2) >= self._config.bridge_area_m2
+        return gap.hidden or min(a.area_m2, b.area_m2) >= self._gaps.bridge_area_m2
 
     def _look(self, a: PlanarInstance, b: PlanarInstance, gap: Gap) -> None:
         """Remember whether a gap parts two instances in the latest view.
@@ -138,7 +140,7 @@ class Joining:
         of the views or more show it: in fewer, it is noise.
         """
         pair, keyframe = frozenset((a, b)), max(a.keyframes[-1], b.keyframes[-1])
-        filled = not gap.open and gap.parts(max(a.area_m2, b.area_m2), self._config)
+        filled = not gap.open and gap.parts(max(a.area_m2, b.area_m2), self._gaps)
         if gap.open:
             self.part(a, b)
         elif filled and pair not in self._apart:
@@ -148,14 +150,14 @@ class Joining:
             looks[keyframe] = filled
             if len(looks) >= self._config.confirm_views and 2 * sum(looks.values()) < len(looks):
                 del self._apart[pair], self._filled[pair]
-                a.seen_past = b.seen_past = True
+                a.record.seen_past = b.record.seen_past = True
 
     def _bounds(self, a: PlanarInstance, b: PlanarInstance, everything: Sequence[PlanarInstance]) -> bool:
         """Whether a pair, one of it large, has everything in front of it: floors, walls and ceilings have, which is
         why parts of them are the same surface even when all between them is yet to be seen.
         """
         large, _ = _by_extent(a, b)
-        least_m2 = self._config.bridge_area_m2
+        least_m2 = self._gaps.bridge_area_m2
         if large.area_m2 < least_m2:
             return False
         behind_m2 = other_m2 = 0.0
@@ -171,17 +173,16 @@ class Joining:
 
         Then the smaller one was a part of the larger one that a view at a bad angle or from afar has bent.
         """
-        found = []
+        found, most = [], self._config.expert.lifetime.through_keyframes
         for index, view in matching.sights.items():
             instance = matching.instances[index]
             if len(view.shown) < LEAST_SAMPLES:
                 continue
             owner = self._taker(matching, view.shown)
-            instance.taken = instance.taken + 1 if owner is instance.taken_by else 1
-            instance.taken_by = owner
+            instance.record.counted_to(owner)
             if owner is None or owner is instance:
                 continue
-            if instance.taken >= self._config.through_keyframes and self._covers(owner, instance):
+            if instance.record.taken >= most and self._covers(owner, instance):
                 found.append((owner, instance))
         return found
 
@@ -200,7 +201,7 @@ class Joining:
         """Whether an instance is larger, and its plane goes through the middle of the smaller one."""
         if large.id == NO_ID or len(large.support) < len(small.support):
             return False
-        return float(offset_sigmas(small.plane, large.plane)) <= self._config.gate_sigmas
+        return float(offset_sigmas(small.plane, large.plane)) <= self._gate_sigmas
 
 
 def _by_extent(a: PlanarInstance, b: PlanarInstance) -> Pair:

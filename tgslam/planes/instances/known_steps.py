@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.config.plane_settings import PlanesConfig
+from tgslam.camera import SensorNoise
+from tgslam.config.plane_settings import PlanesConfig, StepSettings
 from tgslam.geometry import inverse, transform_points
 from tgslam.planes.estimate import stacked
 from tgslam.planes.instances.instance import PlanarInstance
@@ -25,32 +26,28 @@ Vector = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Pixels = NDArray[np.int64]
 
-_SHOWN_SHARE = 0.35  # of what an extent holds, that a view has to show: noise puts next to nothing of it there
-_SIGMAS = 1.3  # of a square of pixels, that half a step has to be
 _WINDOW_PX = 5  # side of the square that tells which of two surfaces a pixel shows
-_PRIOR = 3.0  # logarithm of the odds that other views give it, over the extent and beside it
-_PIECE_SHARE = 0.25  # of the least area of segments, as of pieces
 _BEYOND = 2.0  # times as much as what it has of a place, has a segment that is not only the surface there
 
 
 def with_known_steps(
-    samples: Samples, steps: Sequence[tuple[PlanarInstance, PlanarInstance]], config: PlanesConfig, sigma_per_m2: float
+    samples: Samples, steps: Sequence[tuple[PlanarInstance, PlanarInstance]], config: PlanesConfig, noise: SensorNoise
 ) -> PlaneView:
     """The view of the samples, and in it segments for those surfaces that it has taken for parts of the larger ones.
 
     steps: (smaller, larger) instances with a step between them, one pair at least. The new segments come last, and have
-    to be confirmed as all narrow ones have. sigma_per_m2: sensor noise, sigma_z = this * z^2.
+    to be confirmed as all narrow ones have. noise: the depth sensor's.
     """
-    view = samples.view
+    view, limits = samples.view, config.expert.steps
     corners = np.stack([small.support.corners() for small, _ in steps])
     in_view = may_appear(samples, stacked([small.plane for small, _ in steps]), corners)
-    least_px = _PIECE_SHARE * config.min_area_share * view.labels.size
+    least_px = config.expert.segmentation.piece_share * config.min_area_share * view.labels.size
     for small, large in (steps[i] for i in np.flatnonzero(in_view).tolist()):
-        place = _Place.of(samples, view, small, config, sigma_per_m2)
+        place = _Place.of(samples, view, small, config.max_angle_rad, noise)
         step_m = float(large.plane.heights_m(small.plane.centroid))
-        if place is None or not place.shows(step_m, config.model_sigma_m):
+        if place is None or not place.shows(step_m, config.expert.uncertainty.planarity_sigma_m, limits):
             continue
-        chosen = place.nearer(step_m)
+        chosen = place.nearer(step_m, limits.known_step_odds)
         if np.count_nonzero(chosen) >= least_px:
             view = _with_part(view, place, chosen)
     return view
@@ -69,7 +66,7 @@ class _Place:
 
     @classmethod
     def of(
-        cls, samples: Samples, view: PlaneView, instance: PlanarInstance, config: PlanesConfig, sigma_per_m2: float
+        cls, samples: Samples, view: PlaneView, instance: PlanarInstance, max_angle_rad: float, noise: SensorNoise
     ) -> _Place | None:
         """Of that segment which has most of it; None if that is not parallel, or hardly more than the instance."""
         window = samples.window(instance.support.corners())
@@ -78,14 +75,14 @@ class _Place:
         cells = instance.support.cells_of(transform_points(inverse(samples.T_cw), points.T))
         labels = np.where(instance.support.near(cells, 0.0), view.labels[rows, columns], -1)
         normal = samples.T_cw[:3, :3] @ instance.normal_w
-        turned = np.array([normal @ plane.normal_c < np.cos(config.max_angle_rad) for plane in view.segments], bool)
+        turned = np.array([normal @ plane.normal_c < np.cos(max_angle_rad) for plane in view.segments], bool)
         pixels = np.where(turned, 0, np.bincount(labels + 1, minlength=len(turned) + 1)[1:])
         segment = int(np.argmax(pixels)) if len(pixels) else 0
         if not pixels.any() or view.segments[segment].area_px < _BEYOND * pixels[segment]:
             return None
         plane, chosen = view.segments[segment], labels == segment
         points = points[:, chosen]
-        weight = 1.0 / (sigma_per_m2 * points[2] * (plane.normal_c @ points)) ** 2
+        weight = 1.0 / (noise.per_m2 * points[2] * (plane.normal_c @ points)) ** 2
         over = instance.support.holds(cells[chosen])
         return cls(segment, plane, (rows[chosen], columns[chosen]), points, weight, over)
 
@@ -94,19 +91,19 @@ class _Place:
         """[N] over the segment's plane."""
         return self.plane.normal_c @ self.points + self.plane.offset_m
 
-    def shows(self, step_m: float, model_sigma_m: float) -> bool:
+    def shows(self, step_m: float, planarity_sigma_m: float, config: StepSettings) -> bool:
         """Whether about as much as the extent holds stands off the segment's plane, which squares of pixels can tell.
 
         Cells do not follow the border of a narrow surface: part of it lies beside its extent.
         """
-        sigma_m = float(np.hypot(1.0 / (_WINDOW_PX * np.sqrt(np.median(self.weight))), model_sigma_m))
-        if 0.5 * abs(step_m) < _SIGMAS * sigma_m or not self.over.any():
+        sigma_m = float(np.hypot(1.0 / (_WINDOW_PX * np.sqrt(np.median(self.weight))), planarity_sigma_m))
+        if 0.5 * abs(step_m) < config.known_step_sigmas * sigma_m or not self.over.any():
             return False
-        return bool(np.count_nonzero(self._gain(step_m) > 0) >= _SHOWN_SHARE * np.count_nonzero(self.over))
+        return bool(np.count_nonzero(self._gain(step_m) > 0) >= config.known_step_share * np.count_nonzero(self.over))
 
-    def nearer(self, step_m: float) -> Mask:
-        """[N] the pixels that are more likely to show a plane at such a step than the segment's."""
-        return self._gain(step_m) > np.where(self.over, -_PRIOR, _PRIOR)
+    def nearer(self, step_m: float, odds: float) -> Mask:
+        """[N] the pixels that more likely show a plane at such a step than the segment's. odds: by others."""
+        return self._gain(step_m) > np.where(self.over, -odds, odds)
 
     def _gain(self, step_m: float) -> Vector:
         """[N] logarithm of how much likelier a plane at such a step makes the measurements around each pixel."""

@@ -6,32 +6,25 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from tgslam.config.plane_settings import PlanesConfig
 from tgslam.geometry import inverse
-from tgslam.planes.estimate import PlaneEstimate, deviation_sigmas, from_segments, fuse, stacked
+from tgslam.planes.estimate import PlaneEstimate, deviation_sigmas, stacked
 from tgslam.planes.instances.association import Agreement, Overlap, assign, gate, matching_cost, overlap
+from tgslam.planes.instances.gaps import Gap, adjoins, gap_between, narrowest, shortest_gap
 from tgslam.planes.instances.instance import PlanarInstance
-from tgslam.planes.instances.sight import Samples, Sight, Tolerance, gap_between, may_appear, sight
-from tgslam.planes.instances.support import Cells, Support
+from tgslam.planes.instances.sight import Samples, Sight, Tolerance, may_appear, sight
+from tgslam.planes.instances.support import Cells
+from tgslam.planes.instances.view_planes import ViewPlanes
 
 Vector = NDArray[np.float64]
 
-_CONTACT_CELLS = 3  # in which two surfaces must adjoin
-_LEAST_COMMON = 4  # samples of two masks
+_LEAST_COMMON = 4  # samples of two masks that overlap: fewer may be the noise of their borders
 LEAST_SAMPLES = 12  # of a plane's extent in view, for the view to say something against it
 WELL = 0.5  # of the gate: planes agree well
-_CAREFUL_IOU = 0.15  # of masks that are matched one to one; less is for pieces, which `continued` is for
-_LENIENT_IOU = 0.5  # likewise without care
 _MAIN_SHARE = 0.5  # of what a segment has in common with any instance that it fits, that it has with its own
 _MOST = 0.5  # of a segment that lies on the extent of what it is no new part of
-_GAP_RATIO = 2.0  # the longest gap in sizes of the smaller surface
-_GAP_SLACK_CELLS = 2.0  # wider than at its narrowest place, a gap is not looked at
-_TOUCHING_CELLS = 1.5  # apart, cells are neighbours: then only those that touch say whether there is a gap
-_GAP_PLACES = 12  # at which a gap is looked at
 _SHARED_VIEWS = 5  # latest ones in which two instances are compared
-_DEFERRED_VARIANCE = 4.0  # factor by which an ambiguous segment is less certain than it says
 
 
 class ViewMatching:
@@ -46,14 +39,8 @@ class ViewMatching:
     ) -> None:
         self.samples, self.config, self.tolerance = samples, config, tolerance
         self.instances = list(instances)
-        self.segments = samples.view.segments
-        self._measured = from_segments(self.segments)
-        self.local = self._measured.with_surface_error(self._areas_m2(), config.model_sigma_m)
-        for planes in (self._measured, self.local):
-            planes.covariance[[not s.reliable for s in self.segments]] *= _DEFERRED_VARIANCE
-        misfit = deviation_sigmas(self.local[:, None], self.local[None])
-        self._misfit_sigmas = np.maximum(misfit, misfit.T)  # [S, S] of each segment and each other one
-        self.owner: list[PlanarInstance | None] = [None] * len(self.segments)
+        self.planes = ViewPlanes(samples.view, config.expert.uncertainty)
+        self.owner: list[PlanarInstance | None] = [None] * len(samples.view.segments)
         self.sights = self._sights()
         self._known = len(self.instances)  # those after are new in this view
         self._careful, self._lenient = self._agreements()
@@ -85,7 +72,8 @@ class ViewMatching:
         masks = self._overlap(seen)
         agreement = (self._careful if careful else self._lenient)[np.ix_(free, seen)]
         allowed = agreement.admitted & self._meet(masks)[free]
-        allowed &= masks.iou[free] >= (_CAREFUL_IOU if careful else _LENIENT_IOU)
+        limits = self.config.expert.association
+        allowed &= masks.iou[free] >= (limits.careful_iou if careful else limits.lenient_iou)
         # A piece of one surface is no other surface that happens to have a part of its extent
         common = np.where(agreement.admitted, masks.intersection[free], 0)
         allowed &= common >= _MAIN_SHARE * common.max(axis=1, keepdims=True)
@@ -101,18 +89,19 @@ class ViewMatching:
         """
         new = len(self.instances) - self._known  # these are in this view, which is what decides
         admitted = np.append(self._lenient.admitted[segment], np.ones(new, bool))
-        misfit = np.append(self._careful.deviation_sigmas[segment] / self.config.gate_sigmas, np.zeros(new))
+        gate_sigmas, max_gap_m = self.config.expert.association.gate_sigmas, self.config.expert.gaps.max_gap_m
+        misfit = np.append(self._careful.deviation_sigmas[segment] / gate_sigmas, np.zeros(new))
         best, best_score = None, -np.inf
         for i in np.flatnonzero(admitted):
             instance = self.instances[i]
             pieces = self.pieces(instance)
-            if any(self._is_step(segment, piece) for piece in pieces):
+            if any(self.planes.is_step(segment, piece) for piece in pieces):
                 continue
             fits_well = bool(misfit[i] <= WELL)
             if not (self._coplanar(segment, pieces) if pieces else fits_well or self._overlaps(segment, int(i))):
                 continue
             footprint = self.samples.footprint(segment, instance.support)
-            beside = instance.support.near(footprint, self.config.max_gap_m)
+            beside = instance.support.near(footprint, max_gap_m)
             if not self._joined(segment, footprint, instance, fits_well) or self.is_parted(segment, instance):
                 continue
             score = float(np.mean(beside) - misfit[i])
@@ -143,27 +132,11 @@ class ViewMatching:
 
     def world(self, segment: int) -> PlaneEstimate:
         """A segment's plane in the world."""
-        return self._bent()[segment].transformed(inverse(self.samples.T_cw))
+        return self.planes.bent[segment].transformed(inverse(self.samples.T_cw))
 
     def pieces(self, instance: PlanarInstance) -> list[int]:
         """The segments that show an instance."""
         return [segment for segment, owner in enumerate(self.owner) if owner is instance]
-
-    def combined(self, pieces: list[int]) -> tuple[PlaneEstimate, float, float]:
-        """One plane from several segments: in the camera's frame, as certain as the sensor's noise leaves it, with its
-        area in m2 and RMS in m.
-        """
-        areas = self._areas_m2()[pieces]
-        rms_m = np.array([self.segments[piece].rms_m for piece in pieces])
-        plane = self._measured[pieces[0]] if len(pieces) == 1 else fuse(self._measured[pieces])
-        return plane, float(areas.sum()), float(np.sqrt(areas @ rms_m**2 / max(areas.sum(), 1e-12)))
-
-    def _bent(self) -> PlaneEstimate:
-        """The segments with what the sensor may bend them, as other views have not seen it."""
-        return self.local.with_sensor_bias(self._areas_m2(), self.config.bias_per_m2)
-
-    def _areas_m2(self) -> NDArray[np.float64]:
-        return np.array([segment.area_m2 for segment in self.segments], np.float64)
 
     def _sights(self) -> dict[int, Sight]:
         """What the view says of each instance that may be in it, by index."""
@@ -183,34 +156,32 @@ class ViewMatching:
         the latest, which tells surfaces a few centimetres apart. Leniently: with all views, at the full uncertainty.
         """
         config, position = self.config, self.samples.position_w
-        drift = np.sqrt(1.0 + np.array([i.unseen for i in self.instances], np.float64))[None]
-        local, T_wc = self._bent()[:, None], inverse(self.samples.T_cw)
+        error = config.expert.uncertainty
+        drift = np.sqrt(1.0 + np.array([i.record.unseen for i in self.instances], np.float64))[None]
+        local, T_wc = self.planes.bent[:, None], inverse(self.samples.T_cw)
         all_views, latest = (stacked([getattr(i, name) for i in self.instances]) for name in ("plane", "latest"))
         near = local.with_pose_error(
-            np.minimum(drift * config.step_sigma_rad, config.pose_sigma_rad),
-            np.minimum(drift * config.step_sigma_m, config.pose_sigma_m),
+            np.minimum(drift * error.step_sigma_rad, error.pose_sigma_rad),
+            np.minimum(drift * error.step_sigma_m, error.pose_sigma_m),
         ).transformed(T_wc)
-        far = local.with_pose_error(config.pose_sigma_rad, config.pose_sigma_m).transformed(T_wc)
+        far = local.with_pose_error(error.pose_sigma_rad, error.pose_sigma_m).transformed(T_wc)
         careful = gate(near, all_views[None], position, config).or_better(gate(near, latest[None], position, config))
         return careful, gate(far, all_views[None], position, config)
 
     def _overlap(self, seen: list[int]) -> Overlap:
         """Of all segments with some of the instances in sight."""
-        return overlap(self.samples.label, len(self.segments), [self.sights[i].shown for i in seen])
+        return overlap(self.samples.label, len(self.owner), [self.sights[i].shown for i in seen])
 
     def _meet(self, masks: Overlap) -> NDArray[np.bool_]:
         """[S, G]: whether masks overlap enough."""
-        return (masks.containment >= self.config.min_overlap) & (masks.intersection >= _LEAST_COMMON)
+        least = self.config.expert.association.min_mask_overlap
+        return (masks.containment >= least) & (masks.intersection >= _LEAST_COMMON)
 
     def _overlaps(self, segment: int, index: int) -> bool:
         return index in self.sights and bool(self._meet(self._overlap([index]))[segment, 0])
 
-    def _is_step(self, segment: int, other: int) -> bool:
-        steps = self.samples.view.steps
-        return (segment, other) in steps or (other, segment) in steps
-
     def _coplanar(self, segment: int, pieces: list[int]) -> bool:
-        return bool(np.all(self._misfit_sigmas[segment, pieces] <= self.config.gate_sigmas))
+        return bool(np.all(self.planes.misfit_sigmas[segment, pieces] <= self.config.expert.association.gate_sigmas))
 
     def is_parted(self, segment: int, instance: PlanarInstance) -> bool:
         """Whether gaps part a segment from all others that show the instance, and its extent does not connect them:
@@ -218,15 +189,14 @@ class ViewMatching:
         """
         pieces = self.pieces(instance)
         own = self.samples.footprint(segment, instance.support)
-        whole = instance.seen_past and float(np.mean(instance.support.holds(own))) > _MOST
+        whole = instance.record.seen_past and float(np.mean(instance.support.holds(own))) > _MOST
         for piece in pieces:
             other = self.samples.footprint(piece, instance.support)
             ways = narrowest(instance.support, own, other)
             if ways is None or instance.support.connects(own, other):
                 return False
-            larger_m2 = max(self.segments[segment].area_m2, self.segments[piece].area_m2)
-            gap = gap_between(self.samples, *ways, instance.plane, self.tolerance)
-            if not (gap.open if whole else gap.parts(larger_m2, self.config)):
+            gap, larger_m2 = self._gap(ways, instance), max(self.planes.areas_m2[[segment, piece]])
+            if not (gap.open if whole else gap.parts(larger_m2, self.config.expert.gaps)):
                 return False
         return bool(pieces)
 
@@ -234,45 +204,18 @@ class ViewMatching:
         """Whether a footprint adjoins an instance or, if it fits well, has a short gap to it that is hidden; and the
         gap does not part them.
         """
-        adjoining = adjoins(instance.support.near(footprint, self.config.max_gap_m))
-        ways = shortest_gap(instance.support, footprint, self.config.bridge_m)
+        config = self.config.expert.gaps
+        adjoining = adjoins(instance.support.near(footprint, config.max_gap_m))
+        ways = shortest_gap(instance.support, footprint, config.bridge_m)
         if ways is None:
             return adjoining
-        gap = gap_between(self.samples, *ways, instance.plane, self.tolerance)
-        if gap.parts(max(instance.area_m2, self.segments[segment].area_m2), self.config):
+        gap = self._gap(ways, instance)
+        if gap.parts(max(instance.area_m2, self.planes.areas_m2[segment]), config):
             return False
         return adjoining or (fits_well and gap.hidden)
 
-
-def adjoins(beside: NDArray[np.bool_]) -> bool:
-    """Whether a surface adjoins another, given which of its cells [N] lie beside cells of that."""
-    return int(beside.sum()) >= min(_CONTACT_CELLS, len(beside)) > 0
-
-
-def shortest_gap(support: Support, cells: Cells, longest_m: float) -> tuple[Vector, Vector] | None:
-    """`narrowest` between an extent and cells [N, 2] of its grid; None where even that is wider than longest_m or, if
-    longest_m is finite, than twice the size of the smaller of the two.
-    """
-    occupied, _ = support.cells()
-    gap = narrowest(support, cells, occupied)
-    if gap is None or not np.isfinite(longest_m):
-        return gap
-    limit_m = min(longest_m, _GAP_RATIO * support.cell_m * np.sqrt(min(len(occupied), len(cells))))
-    return gap if np.linalg.norm(gap[1] - gap[0], axis=1).min() <= limit_m + 1e-9 else None
-
-
-def narrowest(support: Support, cells: Cells, others: Cells) -> tuple[Vector, Vector] | None:
-    """Places [K, 3] m of cells [N, 2] of a grid, and those [K, 3] of other cells, between which the gap is narrowest: a
-    few, from all along it. None without cells.
-    """
-    if len(others) == 0 or len(cells) == 0:
-        return None
-    distance, nearest = cKDTree(others).query(cells)
-    least = float(distance.min())
-    slack = _GAP_SLACK_CELLS if least > _TOUCHING_CELLS else 0.0
-    narrow = np.flatnonzero(distance <= least + slack)
-    chosen = narrow[np.linspace(0, len(narrow) - 1, min(len(narrow), _GAP_PLACES)).astype(int)]
-    return support.centres(cells[chosen]), support.centres(others[nearest[chosen]])
+    def _gap(self, ways: tuple[Vector, Vector], instance: PlanarInstance) -> Gap:
+        return gap_between(self.samples, ways, instance.plane, self.tolerance, self.config.expert.gaps.close_before_m)
 
 
 def coplanar_in_views(a: PlanarInstance, b: PlanarInstance) -> float | None:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from tgslam.planes.instances.instance import NO_ID
-
-if TYPE_CHECKING:
-    from tgslam.planes.instances.registry import PlaneRegistry
+from tgslam.planes.instances.instance import NO_ID, PlanarInstance
 
 
 @dataclass(frozen=True)
@@ -24,22 +21,20 @@ class PlaneTable:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def resolved(self, ids: NDArray[np.int32]) -> NDArray[np.int32]:
-        """The ids [...] under which they live on; -1 stays -1."""
-        return np.append(self.ids, np.int32(NO_ID))[ids]
-
     @classmethod
     def empty(cls) -> PlaneTable:
         """No planes."""
         return cls(np.zeros((0, 4)), np.zeros(0, np.int32))
 
     @classmethod
-    def of(cls, registry: PlaneRegistry, count: int) -> PlaneTable:
-        """The planes as the registry knows them now. count: the least id that nothing in the map or keyframes has."""
-        ids = np.array([registry.resolve(plane_id) for plane_id in range(count)], np.int32)
-        instances = registry.instances
-        planes_w = np.zeros((count, 4))
+    def of(cls, instances: Mapping[int, PlanarInstance], ids: NDArray[np.int32]) -> PlaneTable:
+        """Of the PGIs by id. ids: [P] the one under which each id lives on, -1 = removed."""
+        planes_w = np.zeros((len(ids), 4))
         for row in np.flatnonzero(ids != NO_ID):
             instance = instances[int(ids[row])]
             planes_w[row] = *instance.normal_w, instance.offset_m
         return cls(planes_w, ids)
+
+    def resolved(self, ids: ArrayLike) -> NDArray[np.int32]:
+        """The ids under which those of any shape [...] live on; -1 for those removed, and for -1."""
+        return np.append(self.ids, np.int32(NO_ID))[np.asarray(ids, np.intp)]  # -1 takes the last one

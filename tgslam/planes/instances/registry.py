@@ -10,18 +10,20 @@ from numpy.typing import NDArray
 from tgslam.camera import Camera, SensorNoise
 from tgslam.config.plane_settings import PlanesConfig
 from tgslam.planes.estimate import PlaneEstimate
+from tgslam.planes.instances.contradiction import refuted
 from tgslam.planes.instances.directions import stands_as_known
-from tgslam.planes.instances.instance import NO_ID, PlanarInstance, Poses
+from tgslam.planes.instances.instance import NO_ID, PlanarInstance
 from tgslam.planes.instances.joining import Joining
 from tgslam.planes.instances.known_steps import with_known_steps
-from tgslam.planes.instances.matching import LEAST_SAMPLES, ViewMatching
+from tgslam.planes.instances.matching import ViewMatching
+from tgslam.planes.instances.ownership import give_segments
+from tgslam.planes.instances.plane_ids import PlaneIds
 from tgslam.planes.instances.plane_table import PlaneTable
-from tgslam.planes.instances.sight import Samples, Sight, Tolerance
+from tgslam.planes.instances.sight import Samples, Tolerance
 from tgslam.planes.instances.unevenness import is_part
+from tgslam.planes.instances.views import Poses
 from tgslam.planes.segment import PlaneView
 from tgslam.types import FloatImage
-
-_SUSPECT_PLANES = 3  # so many contradicted at once, and more than confirmed: the pose is wrong, not the planes
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class Observation:
 
 
 class PlaneRegistry:
-    """All PGIs of a run. Ids count up from 0 and are never used again.
+    """All PGIs of a run.
 
     A reliable segment that matches nothing is a PGI at once. An ambiguous one is a candidate: it becomes a PGI, with
     its first keyframe, when further views or a reliable segment confirm it, and is dropped when they do not. What is
@@ -49,16 +51,14 @@ class PlaneRegistry:
     """
 
     def __init__(self, config: PlanesConfig, noise: SensorNoise, poses: Poses) -> None:
-        """poses: keyframe -> T_wc [4, 4], kept by somebody else."""
-        depth_sigma_per_m2 = noise.per_m2
-        self._config = config
-        self.version = 0
-        self._tolerance = Tolerance(config.gate_sigmas, depth_sigma_per_m2, config.pose_sigma_rad, config.pose_sigma_m)
+        """noise: the depth sensor's. poses: T_wc [4, 4] of each keyframe, now and later; only read here."""
+        self.version = 0  # grows whenever something may have changed
+        self._config, self._poses = config, poses
+        self._tolerance = Tolerance.of(config, noise)
         self._instances: list[PlanarInstance] = []  # candidates included, oldest first
-        self._poses = poses
-        self._absorbed_by: dict[int, int] = {}
+        self._ids = PlaneIds()
         self._joining = Joining(config, self._tolerance)
-        self._next_id = 0
+        self._table: PlaneTable | None = None  # of this version, once somebody has asked for it
 
     @property
     def instances(self) -> dict[int, PlanarInstance]:
@@ -66,20 +66,17 @@ class PlaneRegistry:
         return {i.id: i for i in sorted(self._instances, key=lambda instance: instance.id) if i.id != NO_ID}
 
     @property
-    def id_count(self) -> int:
-        """How many ids have been given."""
-        return self._next_id
+    def table(self) -> PlaneTable:
+        """The PGIs as they are now, by every id that was ever given."""
+        if self._table is None:
+            instances = self.instances
+            self._table = PlaneTable.of(instances, self._ids.resolved(instances))
+        return self._table
 
     @property
     def candidate_count(self) -> int:
         """Ambiguous surfaces that wait for further views."""
         return sum(instance.is_candidate for instance in self._instances)
-
-    def resolve(self, plane_id: int) -> int:
-        """The id under which a PGI lives on after merges; -1 for one that was removed."""
-        while plane_id in self._absorbed_by:
-            plane_id = self._absorbed_by[plane_id]
-        return plane_id if any(instance.id == plane_id for instance in self._instances) else NO_ID
 
     def seen_from(self, keyframe: int, surface_sigma_m: float | None = None) -> dict[int, PlaneEstimate]:
         """The PGIs that a keyframe saw, by id, each as it saw it: `PlanarInstance.view`."""
@@ -101,98 +98,53 @@ class PlaneRegistry:
         alive = [pair for pair in self._joining.steps() if all(instance in self._instances for instance in pair)]
         if not alive:
             return view
-        samples = Samples.of(view, depth_m, camera, T_cw, self._config.mask_width_px)
-        return with_known_steps(samples, alive, self._config, self._tolerance.sensor_per_m2)
+        samples = self._samples(view, depth_m, camera, T_cw)
+        return with_known_steps(samples, alive, self._config, self._tolerance.noise)
 
     def observe(
         self, view: PlaneView, depth_m: FloatImage, camera: Camera, T_cw: NDArray[np.float64], keyframe: int
     ) -> Observation:
         """Match a keyframe's planes to the PGIs, and let them grow, begin, merge, split and end.
 
-        depth_m: [H, W] m on the host, as the view was made from. keyframe: a number that grows from call to call.
+        depth_m: [H, W] m on the host, as the view was made from. keyframe: a number that grows from call to call, whose
+        pose has been put to the others before.
         """
-        self.version += 1
-        samples = Samples.of(view, depth_m, camera, T_cw, self._config.mask_width_px)
+        self._changed()
+        samples = self._samples(view, depth_m, camera, T_cw)
         matching = ViewMatching(samples, self._instances, self._config, self._tolerance)
-        corrected = self._match(matching, keyframe)
+        corrected = give_segments(matching, self._joining, keyframe, self._config)
         seen = self._integrate(matching, keyframe)
         created, levelled = self._confirm(seen, matching)
-        removed = self._weigh_contradictions(matching, seen)
+        removed = self._end(matching, seen)
         created += self._split(seen)
         merged = [*levelled, *self._overrule(matching), *self._merge(seen, samples)]
         ids = [self._id_of(owner, keyframe) for owner in matching.owner]
         shrunk = tuple(sorted({instance.id for instance in corrected if instance.id != NO_ID}))
         return Observation(keyframe, np.array(ids, np.int32), tuple(created), tuple(merged), tuple(removed), shrunk)
 
-    @property
-    def table(self) -> PlaneTable:
-        """The planes as they are now, by every id that was ever given."""
-        return PlaneTable.of(self, self.id_count)
-
-    def follow(self, corrections: Poses) -> tuple[tuple[int, int], ...]:
-        """Keyframes have moved in the world: p_w <- corrections[keyframe] p_w, [4, 4] each; the others stay.
+    def follow(self, motions: Poses) -> tuple[tuple[int, int], ...]:
+        """Keyframes have moved in the world, p_w <- motions[keyframe] p_w, and their poses have been changed so.
 
         PGIs are computed again from their keyframes' views. Returns merges (kept, absorbed) of those that now coincide.
         """
-        self.version += 1
-        affected = [i for i in self._instances if any(k in corrections for k in i.keyframes)]
+        self._changed()
+        affected = [i for i in self._instances if any(k in motions for k in i.keyframes)]
         for instance in affected:
-            instance.move(corrections, self._poses)
+            instance.follow(motions, self._poses)
         return tuple(self._merge(affected, None))
 
-    def _match(self, matching: ViewMatching, keyframe: int) -> set[PlanarInstance]:
-        """Give every segment its instance; new ones for those that neither overlap nor continue one that there is.
+    def _changed(self) -> None:
+        self.version += 1
+        self._table = None
 
-        Returns with the instances that have lost a part of their extent.
-        """
-        for careful in (True, False):
-            for segment, instance in matching.overlapping(careful):
-                self._give(matching, segment, instance, keyframe)
-        corrected: set[PlanarInstance] = set()
-        for segment in range(len(matching.segments)):
-            if matching.owner[segment] is None:
-                found = matching.continued(segment)
-                if found is None:
-                    found = PlanarInstance(matching.world(segment), self._config)
-                    corrected |= self._part(segment, found, matching)
-                self._give(matching, segment, found, keyframe)
-        for pair in matching.steps():
-            self._joining.step(*pair)
-        return corrected | self._divide(matching)
-
-    def _give(self, matching: ViewMatching, segment: int, instance: PlanarInstance, keyframe: int) -> None:
-        matching.give(segment, instance, keyframe, self._joining.parted_from(instance))
-
-    def _part(self, segment: int, new: PlanarInstance, matching: ViewMatching) -> set[PlanarInstance]:
-        """Take from the instances that were thought to go on over a gap what lies beyond, where that parts them."""
-        parted = matching.parted(segment)
-        for instance in parted:
-            new.support.absorb(*matching.beyond_gap(segment, instance))
-            self._joining.part(instance, new)
-        return set(parted)
-
-    def _divide(self, matching: ViewMatching) -> set[PlanarInstance]:
-        """Where a view shows both of two parted instances, what it shows of the one is no part of the other.
-
-        At a step, only what it shows of the smaller one counts: else the border's noise would wear that away.
-        """
-        corrected = set()
-        for segment, owner in enumerate(matching.owner):
-            if owner is None:
-                continue
-            for other in self._joining.parted_from(owner):
-                worn = self._joining.on_step(owner, other) and len(owner.support) > len(other.support)
-                if worn or not matching.pieces(other):
-                    continue
-                if other.support.remove(matching.samples.footprint(segment, other.support)):
-                    corrected.add(other)
-        return corrected
+    def _samples(self, view: PlaneView, depth_m: FloatImage, camera: Camera, T_cw: NDArray[np.float64]) -> Samples:
+        return Samples.of(view, depth_m, camera, T_cw, self._config.expert.association.mask_width_px)
 
     def _integrate(self, matching: ViewMatching, keyframe: int) -> list[PlanarInstance]:
         """Hand each instance its view; returns the instances in view, oldest first."""
         seen = [instance for instance in matching.instances if matching.pieces(instance)]
         for instance in seen:
-            instance.add_view(keyframe, *matching.combined(matching.pieces(instance)), self._poses)
+            instance.add_view(keyframe, *matching.planes.combined(matching.pieces(instance)), self._poses)
         self._instances = matching.instances
         return seen
 
@@ -204,25 +156,26 @@ class PlaneRegistry:
         created, levelled = [], []
         for instance in seen:
             levelled += self._level(instance)
-            reliable = any(matching.segments[piece].reliable for piece in matching.pieces(instance))
+            reliable = matching.planes.any_reliable(matching.pieces(instance))
             if instance.is_candidate and (reliable or len(instance.keyframes) >= self._needed_views(instance)):
-                created.append(self._name(instance))
+                created.append(self._ids.give(instance))
         for instance in self._instances:
-            instance.unseen += instance not in seen
-        limit = self._config.candidate_keyframes
-        self._instances = [i for i in self._instances if i.id != NO_ID or i.unseen <= limit]
+            instance.record.unseen += instance not in seen
+        limit = self._config.expert.lifetime.candidate_keyframes
+        self._instances = [i for i in self._instances if i.id != NO_ID or i.record.unseen <= limit]
         return created, levelled
 
     def _level(self, instance: PlanarInstance) -> list[tuple[int, int]]:
         """What turns out to be a larger PGI's unevenness goes by that one's id; (kept, given up) if it had its own."""
-        if instance.part_of is not None and _heir(instance) in self._instances:
+        if instance.lineage.part_of is not None and instance.heir in self._instances:
             return []
-        instance.part_of = next((i for i in self._instances if is_part(instance, i, self._config)), None)
-        if instance.part_of is None or instance.id == NO_ID:
+        limits = self._config.expert.segmentation
+        whole = next((i for i in self._instances if is_part(instance, i, limits)), None)
+        instance.lineage.part_of = whole
+        if whole is None or instance.id == NO_ID:
             return []
         given_up, instance.id = instance.id, NO_ID
-        self._absorbed_by[given_up] = instance.part_of.id
-        return [(instance.part_of.id, given_up)]
+        return [self._ids.pass_on(given_up, whole.id)]
 
     def _needed_views(self, candidate: PlanarInstance) -> int:
         """Views that make a candidate a PGI: one less where how it stands speaks for it.
@@ -232,36 +185,17 @@ class PlaneRegistry:
         measured = not self._joining.has_step(candidate)
         return self._config.confirm_views - (measured and stands_as_known(candidate, self._instances, self._config))
 
-    def _weigh_contradictions(self, matching: ViewMatching, seen: list[PlanarInstance]) -> list[int]:
-        """Take back what the view sees through; the ids of PGIs of which nothing is left, or no view speaks for."""
-        sights = [(matching.instances[i], s) for i, s in matching.sights.items()]
-        against = [instance for instance, s in sights if instance not in seen and self._contradicts(s)]
-        if len(against) >= max(_SUSPECT_PLANES, len(seen) + 1):
-            return []
-        for instance, view in sights:
-            instance.support.weaken(view.through_cells)
-            if instance in against:
-                instance.through += 1
-            elif len(view.shown) >= LEAST_SAMPLES:
-                instance.through = 0
-        ended = [i for i in self._instances if self._is_refuted(i)]
+    def _end(self, matching: ViewMatching, seen: list[PlanarInstance]) -> list[int]:
+        """Let go of instances that the view refutes; the ids of those that were PGIs."""
+        ended = refuted(self._instances, matching, seen, self._config.expert.lifetime)
         self._instances = [i for i in self._instances if i not in ended]
         return [instance.id for instance in ended if instance.id != NO_ID]
-
-    def _contradicts(self, view: Sight) -> bool:
-        visible = view.through_count + len(view.shown)
-        return visible >= LEAST_SAMPLES and view.through_share >= self._config.through_share
-
-    def _is_refuted(self, instance: PlanarInstance) -> bool:
-        """One view that sees through it is enough against a candidate."""
-        limit = 1 if instance.id == NO_ID else self._config.through_keyframes
-        return instance.through >= limit or len(instance.support) == 0
 
     def _split(self, seen: list[PlanarInstance]) -> list[int]:
         """Instances that turn out to be two surfaces become two; the ids of the new ones."""
         parts = [part for instance in seen if (part := instance.split(self._poses)) is not None]
         self._instances += parts
-        return [self._name(part) for part in parts]
+        return [self._ids.give(part) for part in parts]
 
     def _overrule(self, matching: ViewMatching) -> list[tuple[int, int]]:
         """Let go of instances that views count to another one: that takes their ids, but not their bent planes."""
@@ -287,30 +221,15 @@ class PlaneRegistry:
 
     def _replace(self, gone: PlanarInstance, kept: PlanarInstance) -> list[tuple[int, int]]:
         """An instance lives on as another one; (kept, gone) if it was a PGI."""
-        gone.merged_into = kept
+        gone.lineage.merged_into = kept
         self._instances = [i for i in self._instances if i is not gone]
         self._joining.replace(gone, kept)
-        if gone.id == NO_ID:
-            return []
-        self._absorbed_by[gone.id] = kept.id
-        return [(kept.id, gone.id)]
-
-    def _name(self, instance: PlanarInstance) -> int:
-        instance.id = self._next_id
-        self._next_id += 1
-        return instance.id
+        return [] if gone.id == NO_ID else [self._ids.pass_on(gone.id, kept.id)]
 
     def _id_of(self, owner: PlanarInstance | None, keyframe: int) -> int:
         """The id of a segment's instance after this keyframe's merges and splits."""
         if owner is None:
             return NO_ID
-        owner = _heir(owner)
+        owner = owner.heir
         split_off = [i.id for i in self._instances if i.split_from is owner and keyframe in i.keyframes]
         return split_off[-1] if split_off and keyframe not in owner.keyframes else owner.id
-
-
-def _heir(instance: PlanarInstance) -> PlanarInstance:
-    """The one under whose id an instance lives on."""
-    while (heir := instance.merged_into or instance.part_of) is not None:
-        instance = heir
-    return instance

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.camera import Camera
+from tgslam.camera import Camera, SensorNoise
 from tgslam.config.plane_settings import PlanesConfig
 from tgslam.geometry import inverse, transform_points
 from tgslam.planes.estimate import PlaneEstimate
@@ -19,10 +19,7 @@ Vector = NDArray[np.float64]
 
 _NEAREST_M = 0.05  # places nearer to the camera's plane than this are not projected
 _GRAZING_COSINE = 0.05  # rays flatter than this say nothing of where they meet a plane
-_LEAST_THROUGH, _THROUGH_SHARE = 3, 0.1  # of the places in a gap: fewer are noise
-_CLOSE_M, _FILLED_SHARE = 0.15, 0.5  # before a plane; of the places in a gap that do not show the plane
-_STEP_M = 0.01  # between the places at which a gap is looked at
-_MARGIN_PX = 8
+_MARGIN_PX = 8  # around what is looked for in an image: its border is known to some cells
 _MAX_FOOTPRINT_CELLS = 1 << 20  # a degenerate segment does not make the grid explode
 
 
@@ -31,9 +28,16 @@ class Tolerance:
     """How far a measured point may lie off a plane that it belongs to: `sigmas` standard deviations of the height."""
 
     sigmas: float
-    sensor_per_m2: float  # sigma_z = this * z^2, 1/m
+    noise: SensorNoise
     pose_rad: float
     pose_m: float
+
+    @classmethod
+    def of(cls, config: PlanesConfig, noise: SensorNoise) -> Tolerance:
+        """As the settings say."""
+        expert = config.expert
+        pose = expert.uncertainty
+        return cls(expert.association.gate_sigmas, noise, pose.pose_sigma_rad, pose.pose_sigma_m)
 
 
 @dataclass(frozen=True)
@@ -55,8 +59,8 @@ class Samples:
         z, label = depth_m[step // 2 :: step, step // 2 :: step], view.labels[step // 2 :: step, step // 2 :: step]
         rows, columns = np.nonzero(z > 0)
         u, v = columns * step + step // 2, rows * step + step // 2
-        rays = np.column_stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))])
-        return cls(camera, T_cw, view, depth_m, rays.astype(np.float32), z[rows, columns], label[rows, columns])
+        rays = camera.rays_at(u, v).astype(np.float32)
+        return cls(camera, T_cw, view, depth_m, rays, z[rows, columns], label[rows, columns])
 
     @property
     def position_w(self) -> Vector:
@@ -70,33 +74,23 @@ class Samples:
 
     def points(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Vector:
         """[3, N] m, camera frame: of pixels [N], all of which are measured."""
-        z, camera = self.depth_m[rows, columns].astype(np.float64), self.camera
-        return np.stack([(columns - camera.cx) / camera.fx * z, (rows - camera.cy) / camera.fy * z, z])
+        return np.ascontiguousarray(self.camera.points_at(columns, rows, self.depth_m[rows, columns]).T)
 
     def window(self, points_w: Vector) -> tuple[slice, slice]:
         """Rows and columns between which the convex hull of points [N, 3] m appears, and a margin of a few pixels."""
-        x, y, z = transform_points(self.T_cw, points_w).T
-        camera, sides = self.camera, []
-        for along, focal, centre, size in (
-            (y, camera.fy, camera.cy, camera.height),
-            (x, camera.fx, camera.cx, camera.width),
-        ):
-            low, high = 0, size
-            if z.min() > _NEAREST_M:
-                at = focal * along / z + centre
-                low, high = (int(np.clip(i, 0, size)) for i in (at.min() - _MARGIN_PX, at.max() + _MARGIN_PX + 1))
-            sides.append(slice(low, high))
-        return sides[0], sides[1]
+        points = transform_points(self.T_cw, points_w)
+        height, width = self.camera.shape
+        if points[:, 2].min() <= _NEAREST_M:
+            return slice(0, height), slice(0, width)
+        u, v = self.camera.project(points)
+        return _span(v, height), _span(u, width)
 
-    def pixels(self, points_w: Vector) -> tuple[NDArray[np.int64], NDArray[np.int64], Vector, NDArray[np.bool_]]:
-        """Where points [N, 3] m appear: columns, rows (0 outside), depths z in m, and whether they are in the image."""
-        x, y, z = transform_points(self.T_cw, points_w).T
-        ahead = z > _NEAREST_M
-        safe = np.where(ahead, z, 1.0)
-        u = np.rint(self.camera.fx * x / safe + self.camera.cx)
-        v = np.rint(self.camera.fy * y / safe + self.camera.cy)
-        inside = ahead & (u >= 0) & (u < self.camera.width) & (v >= 0) & (v < self.camera.height)
-        return np.where(inside, u, 0).astype(np.int64), np.where(inside, v, 0).astype(np.int64), z, inside
+    def pixels(self, points_w: Vector) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+        """Where points [N, 3] m appear: columns and rows (0 outside), and whether they are in the image."""
+        points = transform_points(self.T_cw, points_w)
+        u, v = (np.rint(place) for place in self.camera.project(points))
+        inside = (points[:, 2] > _NEAREST_M) & self.camera.holds(u, v)
+        return np.where(inside, u, 0).astype(np.int64), np.where(inside, v, 0).astype(np.int64), inside
 
     def footprint(self, segment: int, support: Support) -> Cells:
         """The cells [N, 2] of a grid that a segment covers: those whose middle it shows."""
@@ -109,7 +103,7 @@ class Samples:
             return np.unique(touched, axis=0)
         i, j = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]), indexing="ij")
         cells = np.column_stack([i.ravel(), j.ravel()])
-        u, v, _, inside = self.pixels(support.centres(cells))
+        u, v, inside = self.pixels(support.centres(cells))
         shown = cells[inside & (self.view.labels[v, u] == segment)]
         # A strip thinner than a cell may hold no cell's middle
         return shown if len(shown) else np.unique(touched, axis=0)
@@ -138,7 +132,7 @@ def sight(samples: Samples, plane: PlaneEstimate, support: Support, tolerance: T
     local = plane.transformed(samples.T_cw)
     facing = samples.rays @ local.normal.astype(np.float32)
     height = facing * samples.z_m + np.float32(local.offset_m)
-    variance = (tolerance.sensor_per_m2 * samples.z_m**2 * facing) ** 2
+    variance = (tolerance.noise.sigma_m(samples.z_m) * facing) ** 2
     variance += tolerance.pose_m**2 + plane.covariance[2, 2] + (tolerance.pose_rad * samples.z_m) ** 2
     limit = np.float32(tolerance.sigmas) * np.sqrt(variance)
     candidates = np.flatnonzero((facing < -_GRAZING_COSINE) & (height <= limit))
@@ -167,37 +161,7 @@ def may_appear(samples: Samples, planes: PlaneEstimate, corners_w: Vector) -> ND
     return front
 
 
-@dataclass(frozen=True)
-class Gap:
-    """What a keyframe shows of the ways between two parts of a plane."""
-
-    open: bool  # one of them is seen through: the parts are two surfaces, or one with a hole
-    hidden: bool  # all of them are in the image and none is seen through: the plane may go on behind something else
-    filled: bool  # most of what is seen there stands close before the plane, as a board between two fronts does
-
-    def parts(self, larger_m2: float, config: PlanesConfig) -> bool:
-        """Whether it parts two surfaces, of which the larger one has such an area: what fills it hides which they are,
-        and small things that happen to be level are as likely as one behind a board.
-        """
-        return self.open or (self.filled and larger_m2 < config.across_area_m2)
-
-
-def gap_between(samples: Samples, starts_w: Vector, ends_w: Vector, plane: PlaneEstimate, tolerance: Tolerance) -> Gap:
-    """Look at straight ways [K, 3] to [K, 3] m in a plane."""
-    longest_m = float(np.linalg.norm(ends_w - starts_w, axis=1).max())
-    steps = max(int(longest_m / _STEP_M), 3)
-    share = np.linspace(0.0, 1.0, steps + 2)[1:-1, None, None]
-    places = starts_w + share * (ends_w - starts_w)  # [steps, K, 3]
-    u, v, _, inside = samples.pixels(places.reshape(-1, 3))
-    z = np.where(inside, samples.depth_m[v, u], 0.0).astype(np.float64)
-    camera = samples.camera
-    points = np.column_stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z])
-    height = plane.heights_m(transform_points(inverse(samples.T_cw), points))
-    limit = tolerance.sigmas * np.hypot(tolerance.sensor_per_m2 * z**2, tolerance.pose_m)
-    through = ((z > 0) & (height < -limit)).reshape(steps, -1).sum(axis=0)
-    seen = inside.reshape(steps, -1).sum(axis=0)
-    opened = bool(np.any(through >= np.maximum(_LEAST_THROUGH, _THROUGH_SHARE * seen)))
-    # The ends of the ways show the parts themselves
-    between = (z > 0) & (np.abs(height) > limit)
-    close = between & (height > 0) & (height < _CLOSE_M)
-    return Gap(opened, bool(inside.all()) and not opened, bool(close.sum() > _FILLED_SHARE * between.sum()))
+def _span(places: Vector, size: int) -> slice:
+    """The pixels of an image of such a size between places [N] px, and a margin."""
+    low, high = (int(np.clip(i, 0, size)) for i in (places.min() - _MARGIN_PX, places.max() + _MARGIN_PX + 1))
+    return slice(low, high)

@@ -14,7 +14,7 @@ Cells = NDArray[np.int64]
 _MAX_EVIDENCE = 20  # so that what has moved away can be forgotten in reasonable time
 _MAX_SIDE = 1024  # cells; a larger grid gets cells twice the size
 _OUTLINE_SCALE = 2  # outlines are traced at this many pixels a cell
-_MIN_OUTLINE_CELLS = 4
+_MIN_OUTLINE_CELLS = 4  # of a part with an outline: smaller ones are mostly noise of a border
 
 
 class Support:
@@ -99,10 +99,8 @@ class Support:
         """The connected part of each cell of the arrays, from 1; 0 = not occupied."""
         if not self._evidence.size:
             return np.zeros(self._evidence.shape, np.int32)
-        components: NDArray[np.int32] = cv2.connectedComponents((self._evidence > 0).astype(np.uint8), connectivity=4)[
-            1
-        ]
-        return components
+        occupied = (self._evidence > 0).astype(np.uint8)
+        return np.asarray(cv2.connectedComponents(occupied, connectivity=4)[1], np.int32)
 
     def _parts(self, cells: Cells) -> NDArray[np.int32]:
         """The connected parts that these cells [N, 2] belong to."""

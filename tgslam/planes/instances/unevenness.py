@@ -6,17 +6,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.config.plane_settings import PlanesConfig
+from tgslam.config.plane_settings import SegmentationSettings
 from tgslam.planes.instances.instance import NO_ID, PlanarInstance
 
 _LARGER = 4.0  # times as large as its part is a surface
 _LEAST_COSINE = float(np.cos(0.05))  # of the angle by which sensor and surface may turn a small fit
 _MOST_CELLS = 0.9  # of a part, that stand off no more than surfaces stray from planes
 _SURROUNDED = 0.65  # share of the cells around a part that are the larger surface: border strips have half of them
-_AROUND_CELLS = 2
+_AROUND_CELLS = 2  # away is what surrounds a part: borders are known to a cell
 
 
-def is_part(small: PlanarInstance, large: PlanarInstance, config: PlanesConfig) -> bool:
+def is_part(small: PlanarInstance, large: PlanarInstance, config: SegmentationSettings) -> bool:
     """Whether an instance is but an unevenness of another one, which surrounds it and off which it hardly stands.
 
     By how much surfaces stray from their planes is `join_shift_m`. What is fixed to a wall may be no thicker than that;

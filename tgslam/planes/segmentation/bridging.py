@@ -8,20 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from tgslam.config.plane_settings import GapSettings
 from tgslam.ops.plane_fit import CellGrid, Floats, Indices, Labels
 from tgslam.planes.segmentation.merging import Agreement
 from tgslam.planes.segmentation.moments import Joints, planes_of
 
-_SIGMAS = 3.0  # beyond which a measurement lies before or behind a plane
+_SIGMAS = 3.0  # of a pixel's noise, beyond which a measurement lies before or behind a plane
 _OPEN_SHARE = 0.2  # of the ways between two pieces, that may be open: their borders need not be parallel
 _CLOSED_SHARE = 0.5  # of the ways that have to be known to be closed; without measurements nothing is known
 _SEEN_SHARE = 0.5  # of a way that is measured when it is known
 _PARTED_SHARE = 0.5  # of the ways, on which something close before the plane may part it
-_CLOSE_M = 0.15  # before a plane: a board between two fronts; what is farther off only hides part of the view
 _REACH = 2.5  # a gap may be so many times as wide as the larger piece is (root of its area)
-_LINKS = 48
+_LINKS = 48  # ways at most that are looked along, from all along a gap
 _SAMPLES = 16  # along each link, or more where it is longer, in steps of at most a pixel
-_MOST_SAMPLES = 64
+_MOST_SAMPLES = 64  # along a link, which bounds the time that a gap takes
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,12 @@ class Pieces:
 
 
 def bridge(
-    pieces: Pieces, depth_m: NDArray[np.float32], grid: CellGrid, agreement: Agreement, across_area_m2: float
+    pieces: Pieces, depth_m: NDArray[np.float32], grid: CellGrid, agreement: Agreement, config: GapSettings
 ) -> Pieces:
     """Join the pieces that agree in their planes and that no view through keeps apart, those that agree best first.
 
-    depth_m: host [H, W] m, 0 = none. across_area_m2: of two pieces with something else before the gap the larger one
-    has to be as large; small things that happen to be level are as likely. The joined pieces are renumbered.
+    depth_m: host [H, W] m, 0 = none. Of two pieces with something else close before the gap, the larger one has to be
+    large: small things that happen to be level are as likely. The joined pieces are renumbered.
     """
     moments, size = pieces.moments.copy(), len(pieces.moments)
     outlines = _Outlines(pieces.labels)
@@ -47,8 +47,8 @@ def bridge(
     while np.isfinite(cost).any():
         a, b = (int(i) for i in np.unravel_index(np.argmin(cost), cost.shape))
         plane = planes_of(moments[None, a] + moments[None, b])[0]
-        gap = _gap(outlines, a, b, plane, depth_m, grid, agreement.sigma)
-        large = gap.closed and _area_m2(moments[[a, b]], plane, grid).max() >= across_area_m2
+        gap = _gap(outlines, a, b, plane, depth_m, grid, agreement.sigma, config.close_before_m)
+        large = gap.closed and _area_m2(moments[[a, b]], plane, grid).max() >= config.across_area_m2
         if not (gap.closed and (large or gap.free)):
             cost[a, b] = np.inf
             continue
@@ -139,8 +139,9 @@ def _gap(
     depth_m: NDArray[np.float32],
     grid: CellGrid,
     sigma: float,
+    close_m: float,
 ) -> _Gap:
-    """Look along the shortest ways between two pieces."""
+    """Look along the shortest ways between two pieces. close_m: as of `GapSettings`."""
     ends = outlines.links(first, second)
     if not len(ends):
         return _Gap(False, False)
@@ -162,7 +163,7 @@ def _gap(
     if opened.mean() > _OPEN_SHARE or known.mean() < _CLOSED_SHARE:
         return _Gap(False, False)
     before_m = _offset_m(plane, grid) * (1.0 - expected / measured)
-    close = seen & (measured - expected > _SIGMAS * sigma) & (before_m < _CLOSE_M)
+    close = seen & (measured - expected > _SIGMAS * sigma) & (before_m < close_m)
     return _Gap(True, bool(_run(behind | close).mean() <= _PARTED_SHARE))
 
 

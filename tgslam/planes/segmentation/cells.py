@@ -13,8 +13,8 @@ from tgslam.ops import plane_fit
 from tgslam.ops.plane_fit import CellGrid, Floats, Indices
 from tgslam.planes.segmentation.moments import NOISE, Joints, squared_residuals, summed
 
-_FEWEST = 6  # measurements
-_NOISIEST = 5.0  # times as noisy as the sensor should be
+_FEWEST = 6  # measurements of a cell: twice as many as a plane has parameters
+_NOISIEST = 5.0  # times as noisy as the sensor should be, at most: what differs by more is no noise
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from tgslam.camera import Camera
-from tgslam.config.plane_settings import PlanesConfig
+from tgslam.camera import Camera, SensorNoise
+from tgslam.config.plane_settings import PlanesConfig, ReliabilitySettings, SegmentationSettings
 from tgslam.device import runtime
 from tgslam.ops.plane_fit import CellGrid, Floats, Indices, PixelLabels
 from tgslam.planes.segment import PlaneSegment, PlaneView
@@ -19,43 +19,42 @@ from tgslam.planes.segmentation.merging import Agreement, agglomerate
 from tgslam.planes.segmentation.moments import NOISE, noise_of, planes_of, squared_residuals
 from tgslam.planes.segmentation.statistics import Evidence, evidence, totals
 
-_ROBUST_ROUNDS = 2
-_CHARBONNIER_SIGMAS = 1.5
-_RELIABLE_PART = 0.7  # of the limits beyond which there is no plane
-_PIECE_SHARE = 0.25  # of the least area, that pieces have before they are joined across gaps
-_MIN_CELLS = 2
+_ROBUST_ROUNDS = 2  # of labels and fit: the first labels are by planes of whole cells, the second by planes of pixels
+_CHARBONNIER_SIGMAS = 1.5  # of the sensor: what is farther off a plane counts less and less in its fit
+_MIN_CELLS = 2  # of a piece: one cell has no neighbour to agree with
 _LAYER_PIECES = 4  # times as large as a piece is a part that is taken out of one
-_LARGE_SHARE = 0.05  # of the image
+_LARGE_SHARE = 0.05  # of the image, that a group has for cells to join it from anywhere
 _SQUARE_CELLS = 4  # side of the squares that tell the sensor's far-reaching errors from those of a few pixels
-_FEWEST_PX = 6
+_FEWEST_PX = 6  # of a segment, however small the image: twice as many as a plane has parameters
 
 
-def extract_planes(depth_m: np.ndarray, camera: Camera, config: PlanesConfig, sigma_per_m2: float) -> PlaneView:
+def extract_planes(depth_m: np.ndarray, camera: Camera, config: PlanesConfig, noise: SensorNoise) -> PlaneView:
     """Find the planes that a depth image shows, the largest first.
 
-    depth_m: device float32 [H, W], m, 0 = none. sigma_per_m2: sensor noise, sigma_z = this * z^2; in inverse depth,
-    in which planes are affine in the pixel, it is the same everywhere. Pixels of no plane are labelled -1. Segments
-    that other views have to confirm (small, thin, grazing, rough) come with reliable=False.
+    depth_m: device float32 [H, W], m, 0 = none. noise: the sensor's; in inverse depth, in which planes are affine in
+    the pixel, it is the same everywhere. Pixels of no plane are labelled -1. Segments that other views have to confirm
+    (small, thin, grazing, rough) come with reliable=False.
     """
-    grid = CellGrid.across(camera, config.cells_across)
-    pieces, agreement = _pieces(depth_m, grid, config, sigma_per_m2)
+    limits, sigma = config.expert.segmentation, noise.per_m2
+    grid = CellGrid.across(camera, config.segmentation_cells_across)
+    pieces, agreement = _pieces(depth_m, grid, config, sigma)
     if not len(pieces.moments):
-        return PlaneView(np.full((camera.height, camera.width), -1, np.int32), ())
+        return PlaneView(np.full(camera.shape, -1, np.int32), ())
     pixels = PixelLabels(depth_m, grid, pieces.labels)
-    noise, pairs = noise_of(pieces.moments), bordering(pieces.labels)
+    seen_sigma, pairs = noise_of(pieces.moments), bordering(pieces.labels)
     planes, _, _ = parallel(planes_of(pieces.moments), pieces.moments, pairs, agreement, grid.cell_px)
     spread = np.sqrt(squared_residuals(pieces.moments) / pieces.moments[:, 0])
-    tolerance = config.pixel_sigmas * np.clip(spread, noise, config.max_rms_sigmas * noise)
+    tolerance = limits.pixel_sigmas * np.clip(spread, seen_sigma, limits.max_rms_sigmas * seen_sigma)
     for _ in range(_ROBUST_ROUNDS):
         pixels.assign(planes, tolerance)
         before = planes
-        sums = pixels.sums(before, _CHARBONNIER_SIGMAS * sigma_per_m2)
-        moments = np.column_stack([totals(sums, len(before)), noise**2])
+        sums = pixels.sums(before, _CHARBONNIER_SIGMAS * sigma)
+        moments = np.column_stack([totals(sums, len(before)), seen_sigma**2])
         moments[:, NOISE] *= moments[:, 0]
         planes, aligned, stepped = parallel(before + planes_of(moments), moments, pairs, agreement, grid.cell_px)
     fewest_px = max(config.min_area_share * camera.width * camera.height, _FEWEST_PX)
-    seen = evidence(planes, planes - before, sums, grid, sigma_per_m2, fewest_px)
-    found = _with_alignment(_judged(seen, noise / sigma_per_m2, grid, config), aligned)
+    seen = evidence(planes, planes - before, sums, grid, sigma, fewest_px)
+    found = _with_alignment(_judged(seen, seen_sigma / sigma, grid, config), aligned)
     number = np.full(len(planes) + 1, -1, np.int32)
     number[[index for index, _ in found]] = np.arange(len(found))
     steps = frozenset((int(number[i]), int(number[j])) for i, j in stepped if number[i] >= 0 and number[j] >= 0)
@@ -67,18 +66,19 @@ def _pieces(depth_m: np.ndarray, grid: CellGrid, config: PlanesConfig, sigma: fl
 
     Returns with how far parts of one surface may differ.
     """
-    graph = planar_cells(depth_m, grid, sigma, config.cell_share, config.cell_sigmas)
-    squares = graph.squares(grid.shape, _SQUARE_CELLS, config.cell_sigmas)
-    agreement = Agreement.seen_among(graph, squares, sigma, config.join_sigmas, config.join_shift_sigmas)
-    lenient = dataclasses.replace(agreement, shift_m=config.join_shift_m)
+    limits = config.expert.segmentation
+    graph = planar_cells(depth_m, grid, sigma, limits.cell_share, limits.cell_sigmas)
+    squares = graph.squares(grid.shape, _SQUARE_CELLS, limits.cell_sigmas)
+    agreement = Agreement.seen_among(graph, squares, sigma, limits.join_sigmas, limits.join_shift_sigmas)
+    lenient = dataclasses.replace(agreement, shift_m=limits.join_shift_m)
     group, moments = agglomerate(graph.moments, _continuous(graph, agreement), lenient)
     image_px = grid.camera.width * grid.camera.height
-    least_px = _PIECE_SHARE * config.min_area_share * image_px
+    least_px = limits.piece_share * config.min_area_share * image_px
     group = np.where(moments[group, 0] >= least_px, group, -1)
-    group, parent = part_layers(graph, grid.shape, group, lenient, _LAYER_PIECES * least_px)
+    group, parent = part_layers(graph, grid.shape, group, lenient, _LAYER_PIECES * least_px, config.expert.steps)
     group = settle(graph, grid.shape, group, _LARGE_SHARE * image_px, parent)
     pieces = _numbered(graph, group, grid, least_px)
-    return bridge(pieces, runtime.to_host(depth_m), grid, agreement, config.across_area_m2), lenient
+    return bridge(pieces, runtime.to_host(depth_m), grid, agreement, config.expert.gaps), lenient
 
 
 def _numbered(graph: CellGraph, group: Indices, grid: CellGrid, least_px: float) -> Pieces:
@@ -100,11 +100,12 @@ def _judged(
     candidates: Iterable[tuple[int, Evidence]], noise_sigmas: Floats, grid: CellGrid, config: PlanesConfig
 ) -> list[tuple[int, PlaneSegment]]:
     """Index and segment of the largest ones that are planes. noise_sigmas: [P] the noise as the sensor's standard."""
-    found = []
+    found, limits = [], config.expert.segmentation
     for index, seen in candidates:
-        smooth = seen.segment.rms_sigmas <= config.max_rms_sigmas * noise_sigmas[index]
-        if smooth and _bend(seen, config) <= 1.0:
-            reliable = _is_reliable(seen, grid, config)
+        smooth = seen.segment.rms_sigmas <= limits.max_rms_sigmas * noise_sigmas[index]
+        bend = _bend(seen, limits)
+        if smooth and bend <= 1.0:
+            reliable = _is_reliable(seen, bend, grid, config.expert.reliability)
             found.append((index, dataclasses.replace(seen.segment, reliable=reliable)))
     found.sort(key=lambda item: (-item[1].area_px, item[0]))
     return found[: config.max_segments]
@@ -122,21 +123,24 @@ def _with_alignment(found: list[tuple[int, PlaneSegment]], aligned: dict[int, in
     return list(segments.items())
 
 
-def _bend(seen: Evidence, config: PlanesConfig) -> float:
+def _bend(seen: Evidence, limits: SegmentationSettings) -> float:
     """By how much a surface is bent, over what is allowed: what the sensor may feign, or a real plane's unevenness."""
-    return min(seen.bend_sigmas / config.max_bend_sigmas, seen.bend_m / config.max_bend_m)
+    return min(seen.bend_sigmas / limits.max_bend_sigmas, seen.bend_m / limits.max_bend_m)
 
 
-def _is_reliable(seen: Evidence, grid: CellGrid, config: PlanesConfig) -> bool:
-    """Whether a segment counts by itself: other views have to confirm small, thin, grazing, rough and bent ones."""
+def _is_reliable(seen: Evidence, bend: float, grid: CellGrid, limits: ReliabilitySettings) -> bool:
+    """Whether a segment counts by itself: other views have to confirm small, thin, grazing, rough and bent ones.
+
+    bend: as of `_bend`.
+    """
     segment, image_px = seen.segment, grid.camera.width * grid.camera.height
     turn = float(np.sqrt(np.linalg.eigvalsh(segment.covariance[:2, :2])[-1]))
     return bool(
-        segment.area_px >= config.reliable_area_share * image_px
-        and turn <= config.reliable_angle_rad
-        and np.sqrt(segment.covariance[2, 2]) <= config.reliable_offset_m
-        and seen.cosine >= config.reliable_cosine
-        and _bend(seen, config) <= _RELIABLE_PART
-        and seen.curvature <= config.reliable_curvature
-        and seen.width_px >= config.reliable_width_cells * grid.cell_px
+        segment.area_px >= limits.reliable_area_share * image_px
+        and turn <= limits.reliable_angle_rad
+        and np.sqrt(segment.covariance[2, 2]) <= limits.reliable_offset_m
+        and seen.cosine >= limits.reliable_cosine
+        and bend <= limits.reliable_bend_share
+        and seen.curvature <= limits.reliable_curvature
+        and seen.width_px >= limits.reliable_width_cells * grid.cell_px
     )

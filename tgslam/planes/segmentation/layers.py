@@ -12,30 +12,34 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from tgslam.config.plane_settings import StepSettings
 from tgslam.ops.plane_fit import Floats, Indices, Labels
 from tgslam.planes.segmentation.cells import CellGraph
 from tgslam.planes.segmentation.merging import Agreement
 from tgslam.planes.segmentation.moments import NOISE, Joints, information, planes_of, summed, width_px
 
-_WINDOW_CELLS = 3  # over which misfits are averaged
-_OFF_SIGMAS = 2.5  # of such means: beyond it a cell stands off
-_LINE_CELLS, _LINE_WIDTH_CELLS = 11, 1.5  # windows along which misfits are averaged to find strips
-_LINE_DIRECTIONS = 8
-_SURE_SIGMAS, _LIKELY_SIGMAS = 4.5, 2.0  # of such means: of a strip at one place at least, and of all of it
-_TYPICAL = 0.75  # quantile of the misfits of such cells that is the step's
+_WINDOW_CELLS = 3  # side of the squares over which misfits are averaged: the smallest with a cell in its middle
+_LINE_CELLS, _LINE_WIDTH_CELLS = 11, 1.5  # length and width of the lines over which they are, to find strips
+_LINE_DIRECTIONS = 8  # of lines: the ends of one are at most a cell away from a strip through its middle
+_TYPICAL = 0.75  # quantile of the misfits of such cells that is the step's: those at its border have less
 _DEVIATION = 1.4826  # standard deviations that a median of magnitudes stands for
-_ROUNDS = 3
+_ROUNDS = 3  # of settling at most: a cell follows its neighbours by so many
 _NEIGHBOUR = 6.0  # squared sigmas of misfit that a neighbour of the same surface is worth
 _LARGE = 6.0  # likewise, that the surface is large, and needs no plane of its own
 _LARGER = 4.0  # times as many points has a surface that another one is taken to be parallel to
 _MIXED_SHARE = 0.25  # of a small group's nodes, that another plane fits better: fewer are noise
 _NARROW_CELLS = 5  # wide is a strip that may seem turned by as much as surfaces stray from planes
-_FEWEST_PX = 6.0  # of what is compared
-_STEP_M = 0.1  # along the line of sight at most from one to the other
+_FEWEST_PX = 6.0  # of what is compared: twice as many as a plane has parameters
+_STEP_M = 0.1  # along the line of sight at most: what stands farther before a surface need not be parallel to it
 
 
 def part_layers(
-    graph: CellGraph, shape: tuple[int, int], group: Indices, agreement: Agreement, least_px: float
+    graph: CellGraph,
+    shape: tuple[int, int],
+    group: Indices,
+    agreement: Agreement,
+    least_px: float,
+    config: StepSettings,
 ) -> tuple[Indices, Indices]:
     """The group of each node [N], -1 = none, where parts of a group that stand off its plane are groups of their own.
 
@@ -49,7 +53,7 @@ def part_layers(
     for find in (_standing_off, _strips):
         for index in np.flatnonzero(moments[:, 0] > 2 * least_px):
             nodes = np.flatnonzero(group == index)
-            for part in find(misfit[nodes], graph.cell[nodes], shape, graph.moments[nodes, 0], least_px):
+            for part in find(misfit[nodes], graph.cell[nodes], shape, graph.moments[nodes, 0], least_px, config):
                 chosen = graph.moments[nodes[part]].sum(axis=0)
                 pair = np.stack([chosen, moments[index] - chosen])
                 if chosen[0] >= least_px and not _agree(pair, agreement):
@@ -212,7 +216,7 @@ def _squares(moments: Floats, planes: Floats) -> Floats:
 
 
 def _standing_off(
-    misfit: Floats, cell: Indices, shape: tuple[int, int], points: Floats, least_px: float
+    misfit: Floats, cell: Indices, shape: tuple[int, int], points: Floats, least_px: float, config: StepSettings
 ) -> list[NDArray[np.bool_]]:
     """The connected parts of a surface's nodes, as masks [K], that stand off its plane by `misfit` [K], 1/m.
 
@@ -222,7 +226,7 @@ def _standing_off(
     mask.ravel()[cell], image.ravel()[cell] = 1.0, misfit
     window = (_WINDOW_CELLS, _WINDOW_CELLS)
     mean = (cv2.blur(image, window) / np.maximum(cv2.blur(mask, window), 1e-6)).ravel()[cell]
-    limit = _OFF_SIGMAS * _DEVIATION * _median(np.abs(mean))
+    limit = config.step_sigmas * _DEVIATION * _median(np.abs(mean))
     parts = []
     for side in (1.0, -1.0):
         off = side * mean > limit
@@ -236,7 +240,7 @@ def _standing_off(
 
 
 def _strips(
-    misfit: Floats, cell: Indices, shape: tuple[int, int], points: Floats, least_px: float
+    misfit: Floats, cell: Indices, shape: tuple[int, int], points: Floats, least_px: float, config: StepSettings
 ) -> list[NDArray[np.bool_]]:
     """Like `_standing_off`: parts so narrow and far away that only means along them tell them from noise.
 
@@ -255,12 +259,12 @@ def _strips(
         sums = np.where(whole, sums / np.sqrt(np.maximum(cells, 1.0)), 0.0)
         sigma = _DEVIATION * _median(np.abs(sums[whole])) if whole.any() else 0.0
         for height in (sums, -sums):
-            if height.max() > _SURE_SIGMAS * sigma:
-                parts = _above(_LIKELY_SIGMAS * sigma, height, cell, shape, points, least_px)
+            if height.max() > config.strip_sure_sigmas * sigma:
+                parts = _above(config.strip_likely_sigmas * sigma, height, cell, shape, points, least_px)
                 found += [(float(height[part].max() / sigma), part) for part in parts]
     chosen: list[NDArray[np.bool_]] = []
     for sigmas, part in sorted(found, key=lambda item: -item[0]):
-        if sigmas > _SURE_SIGMAS and not any((part & other).any() for other in chosen):
+        if sigmas > config.strip_sure_sigmas and not any((part & other).any() for other in chosen):
             chosen.append(part)
     return chosen
 

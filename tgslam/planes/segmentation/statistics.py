@@ -12,8 +12,8 @@ from tgslam.planes.segment import PlaneSegment
 from tgslam.planes.segmentation.moments import information, scatter, summed, width_px
 
 _CLUSTER_CELLS = 4  # side of the squares of cells within which noise may be correlated
-_FITTED = 3  # parameters
-_LEAST_CELLS = 6  # that tell a paraboloid
+_FITTED = 3  # parameters of a plane
+_LEAST_CELLS = 6  # that tell a paraboloid: as many as it has parameters
 _DEGREES = [(degree - k, k) for degree in range(5) for k in range(degree + 1)]  # of x and y: 1, x, y, xx, xy, yy, ...
 _PRODUCTS = np.array([[_DEGREES.index((a + c, b + d)) for c, d in _DEGREES[:6]] for a, b in _DEGREES[:6]])
 _LEAST_WIDTH_PX = 1.0  # of what is not a line
