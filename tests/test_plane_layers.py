@@ -297,7 +297,7 @@ def test_a_surface_that_waits_for_other_views_is_no_part_of_the_floor_that_it_st
     for index, T_cw in enumerate(ALONG[:2]):
         depth_m, labels = measured([WALL, BOARD, floor], T_cw, index)
         world.observe(T_cw, depth_m)
-        view = seen(depth_m)
+        view = seen(world.map.keyframes[-1].depth_m())
         waiting = view.labels == of_board(view, labels)
         assert waiting.sum() > 500
         assert (world.shown(-1)[waiting] == -1).all()

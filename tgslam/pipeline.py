@@ -16,8 +16,8 @@ from tgslam.errors import FrameError, TrackingError
 from tgslam.output.log import FrameLog
 from tgslam.output.ply import write_map
 from tgslam.output.progress import FrameObserver
-from tgslam.output.results import Found, write_results
 from tgslam.output.run_folder import RunFolder
+from tgslam.output.run_results import Found, write_results
 from tgslam.output.trajectory_io import write_trajectory
 from tgslam.types import Frame, FrameReport, FrameStatus
 
