@@ -162,7 +162,7 @@ def test_a_setting_of_planes_has_a_name_of_its_own() -> None:
         ("dataset: {fx: 1e999}", "must be a number"),
         ("dataset: {fx: true}", "must be a number"),
         ("dataset: {fx: '5'}", "must be a number"),
-        ("dataset: {format: kitti}", "`dataset.format` = kitti must be one of synthetic, tum, icl"),
+        ("dataset: {format: kitti}", "`dataset.format` = kitti must be one of auto, synthetic, tum, icl"),
         ("dataset: {format: 1}", "must be one of"),
         ("dataset: {distortion: 1.0}", "must be a list (each a number)"),
         ("dataset: {distortion: [1.0, a]}", "must be a list"),

@@ -55,11 +55,11 @@ def test_noise_says_what_flies() -> None:
 
 @pytest.mark.parametrize("shape", [(40, 59), (39, 60)])
 def test_images_of_another_size_are_refused(shape: tuple[int, int]) -> None:
-    message = r"frame 7: images of \(\d+, \d+\) do not fit the camera's \(40, 60\)"
-    with pytest.raises(FrameError, match=message):
+    message = r"frame 7: {} must be an array of shape \[40, 60.*, but is \[\d+, \d+"
+    with pytest.raises(FrameError, match=message.format("depth_m")):
         Preparation(CAMERA, NOISE)(frame(np.ones(shape)))
     colour = np.zeros((*shape, 3), np.float32)
-    with pytest.raises(FrameError, match=message):
+    with pytest.raises(FrameError, match=message.format("colour")):
         Preparation(CAMERA, NOISE)(Frame(7, 0.0, colour, slope()))
 
 

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam.boundary import FrameCheck
 from tgslam.camera import Camera, SensorNoise
 from tgslam.device import runtime
 from tgslam.errors import FrameError
@@ -24,17 +25,16 @@ class Preparation:
     """Drops what is no measurement of a surface, and takes frames to the device."""
 
     def __init__(self, camera: Camera, noise: SensorNoise) -> None:
-        self._camera, self._noise = camera, noise
+        self._camera, self._noise, self._check = camera, noise, FrameCheck(camera)
 
     def __call__(self, frame: Frame) -> Frame:
         """The frame without flying pixels, as device arrays. Raises FrameError for a frame that cannot be used."""
-        size = self._camera.shape
-        if frame.depth_m.shape != size or frame.colour.shape != (*size, 3):
-            raise FrameError(f"frame {frame.index}: images of {frame.depth_m.shape} do not fit the camera's {size}")
+        frame = self._check(frame)
         in_range = without_range_limit(frame.depth_m, self._noise)
         depth_m = without_flying_pixels(runtime.to_device(in_range), self._noise, self._camera.fx)
         if measured_share(depth_m) < _MIN_DEPTH_SHARE:
             raise FrameError(f"frame {frame.index}: depth in less than {_MIN_DEPTH_SHARE:.0%} of its pixels")
+        self._check.accept(frame)
         return replace(frame, colour=runtime.to_device(frame.colour), depth_m=depth_m)
 
 

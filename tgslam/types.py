@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +15,17 @@ Matrix4 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Frame:
-    """One RGB-D image pair. It carries no pose: ground truth stays out of the system's reach."""
+    """One RGB-D image pair. It carries no pose: ground truth stays out of the system's reach.
+
+    Programs may hand over what their sensor gives, 8-bit colour and 16-bit depth with its scale; the system turns it
+    into float32, and checks it, once (`preparation`).
+    """
 
     index: int  # position in the sequence
     timestamp_s: float
-    colour: FloatImage  # [H, W, 3] RGB in [0, 1], sRGB as stored
-    depth_m: FloatImage  # [H, W] z in metres, 0 = no measurement
+    colour: NDArray[Any]  # [H, W, 3] RGB, sRGB as stored: float in [0, 1], or uint8
+    depth_m: NDArray[Any]  # [H, W] z, 0 or not finite = no measurement: float, or uint16 with a scale
+    depth_scale: float = 1.0  # units of `depth_m` in a metre: 1000 for millimetres
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from tgslam.camera import Camera
 from tgslam.config.input_settings import SyntheticConfig
 from tgslam.datasets.built_in import SyntheticSource, synthetic_camera
-from tgslam.datasets.image_files import colour_as_float, read_colour, read_raw_depth
+from tgslam.datasets.image_files import read_colour, read_raw_depth
 from tgslam.device import runtime
 from tgslam.errors import FrameError
 from tgslam.ops.rasterize import ImageGradient
+from tgslam.pixels import colour_as_float
 from tgslam.types import Frame, Gaussians
 
 FRAME_STRIDE = 2  # px between the Gaussians of a frame from files

@@ -12,7 +12,9 @@ class DatasetConfig:
     """Where frames come from. Camera values of 0 mean: take them from the dataset format (or its calibration file)."""
 
     format: str = setting(
-        "synthetic", choices=("synthetic", "tum", "icl"), doc="Built-in scene, TUM RGB-D or ICL-NUIM folder."
+        "auto",
+        choices=("auto", "synthetic", "tum", "icl"),
+        doc="Built-in scene, TUM RGB-D or ICL-NUIM folder; auto: told from the folder's files, without one the scene.",
     )
     fx: float = setting(0.0, doc="Focal length across, px.")
     fy: float = setting(

@@ -26,7 +26,7 @@ from tgslam.errors import ConfigError
 _BASE_KEY = "base"
 
 
-def load(path_or_name: Path | None = None, overrides: Sequence[str] = ()) -> Config:
+def load(path_or_name: str | Path | None = None, overrides: Sequence[str] = ()) -> Config:
     """The settings of a run: defaults, overridden by a YAML file, overridden by `overrides`.
 
     path_or_name: a file, or the name of a packaged config ("tum", "tum.yaml", "configs/tum.yaml"); None = defaults.
@@ -52,7 +52,7 @@ def dump(config: Config) -> str:
     return to_yaml(_to_mapping(config))
 
 
-def find_config(path_or_name: Path) -> Path:
+def find_config(path_or_name: str | Path) -> Path:
     """The file that `path_or_name` means: itself if it exists, else the packaged config of that name.
 
     Raises ConfigError that lists the packaged names when there is neither.

@@ -20,11 +20,6 @@ def open_source(config: DatasetConfig, synthetic: SyntheticConfig, seed: int, in
     does not go with it.
     """
     if config.format == "synthetic":
-        if input_dir is not None:
-            raise ConfigError(
-                f"{input_dir}: a folder does not go with dataset.format=synthetic; "
-                "leave --input out, or set dataset.format to auto, tum or icl"
-            )
         from tgslam.datasets.built_in import SyntheticSource  # brings in the renderer, which folders do without
 
         return SyntheticSource(synthetic, seed)

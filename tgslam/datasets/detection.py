@@ -16,8 +16,14 @@ _log = logging.getLogger(__name__)
 def told_format(config: DatasetConfig, folder: Path | None) -> DatasetConfig:
     """The settings with the format of the folder where they leave it open ("auto"); None = the built-in scene.
 
-    A camera that they give stays. Raises ConfigError when the folder's files tell no format.
+    A camera that they give stays. Raises ConfigError when the folder's files tell no format, and for a folder where the
+    settings ask for a built-in scene.
     """
+    if config.format == "synthetic" and folder is not None:
+        raise ConfigError(
+            f"{folder}: a folder does not go with dataset.format=synthetic; leave --input out, or set dataset.format "
+            "to auto, tum or icl"
+        )
     if config.format != "auto":
         return config
     if folder is None:

@@ -12,6 +12,7 @@ from tgslam.datasets.groundtruth import read_groundtruth
 from tgslam.datasets.lists import ImagePair
 from tgslam.datasets.truth import SceneTruth
 from tgslam.errors import DatasetError, FrameError
+from tgslam.pixels import colour_as_float
 from tgslam.types import Frame, Trajectory
 
 
@@ -79,7 +80,7 @@ class FolderSource:
                 f"{pair.depth}: no pixel has a depth from {config.min_depth_m:g} to {config.max_depth_m:g} m; "
                 "if all frames say so, check dataset.depth_scale"
             )
-        return Frame(index, pair.timestamp_s, images.colour_as_float(rgb), depth_m)
+        return Frame(index, pair.timestamp_s, colour_as_float(rgb), depth_m)
 
     def groundtruth(self) -> Trajectory | None:
         """Camera-to-world poses from the ground truth file, or None without one. Raises DatasetError."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.errors import FrameError
+from tgslam.pixels import depth_as_metres
 from tgslam.types import FloatImage
 
 _PNG_START, _PNG_END = b"\x89PNG", b"IEND"
@@ -35,16 +36,10 @@ def read_raw_depth(path: Path) -> NDArray[np.uint16]:
 
 def depth_in_metres(raw: NDArray[np.uint16], units_per_metre: float, min_m: float, max_m: float) -> FloatImage:
     """Raw depth [H, W] -> metres; values outside [min_m, max_m] become 0 (no measurement)."""
-    depth_m = raw.astype(np.float32)
-    depth_m *= np.float32(1.0 / units_per_metre)
+    depth_m = depth_as_metres(raw, units_per_metre)
     low, high = math.ceil(min_m * units_per_metre - 1e-6), math.floor(max_m * units_per_metre + 1e-6)
     depth_m[(raw < low) | (raw > high)] = 0.0  # compared in whole units: exact at the limits
     return depth_m
-
-
-def colour_as_float(rgb: NDArray[np.uint8]) -> FloatImage:
-    """8-bit colour [H, W, 3] -> float32 in [0, 1]."""
-    return np.multiply(rgb, np.float32(1.0 / 255.0), dtype=np.float32)
 
 
 class Undistorter:
