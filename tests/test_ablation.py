@@ -33,9 +33,9 @@ GATE = ("gate", "--scene", "room", "--quiet")
 FAKE_RUN = """
 import dataclasses, sys, time
 from pathlib import Path
+from tgslam.camera import Camera
 from tgslam.config.loader import load
 from tgslam.output.run_folder import RunFolder, RunRecord, RunState
-from tgslam.types import Camera
 assert sys.argv[1] == "run" and "--overwrite" in sys.argv
 config, output = load(Path(sys.argv[2])), Path(sys.argv[sys.argv.index("--output") + 1])
 if config.seed == 15:
