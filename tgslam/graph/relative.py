@@ -23,7 +23,7 @@ from tgslam.types import RelativePose
 Vector = NDArray[np.float64]
 Lineariser = Callable[[Vector], "Quadratic"]
 
-_ITERATIONS = 10  # at most; exact planes settle in three or four
+_ITERATIONS = 10  # at most: where it converges at all, steps become none before
 _SETTLED = 1e-5  # rad and m: a smaller step is none
 
 

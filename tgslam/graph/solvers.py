@@ -9,8 +9,8 @@ import gtsam
 
 from tgslam.config.graph_settings import SolvingSettings
 
-_ROUNDS = 5  # updates at most of one call; nothing has to be linearised anew after two or three
-_MAX_ITERATIONS = 50  # of the batch solver: more than it has needed
+_ROUNDS = 5  # updates at most of one call, until nothing has to be linearised anew; the next call goes on from there
+_MAX_ITERATIONS = 50  # of the batch solver, which mostly ends long before by itself
 
 
 class Solver(Protocol):
