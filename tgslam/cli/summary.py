@@ -6,7 +6,7 @@ from typing import Any
 
 from tgslam.output.console import print_table
 
-_LINES = (  # label, key, format
+LINES = (  # label, key, format
     ("frames", "frames", "{:d}"),
     ("skipped", "frames_skipped", "{:d}"),
     ("lost", "frames_lost", "{:d}"),
@@ -16,7 +16,7 @@ _LINES = (  # label, key, format
     ("planes", "planes", "{:d}"),
     ("plane area", "plane_area_m2", "{:.1f} m2"),
     ("plane residual, RMS", "plane_rms_mm", "{:.1f} mm"),
-    ("closures", "closure edges", "{:d}"),
+    ("closure edges", "closures", "{:d}"),
     ("ATE, keyframes", "ate_rmse_cm", "{:.2f} cm"),
     ("ATE, all frames", "ate_rmse_all_cm", "{:.2f} cm"),
     ("RPE, translation", "rpe_trans_cm", "{:.3f} cm"),
@@ -45,7 +45,7 @@ _LINES = (  # label, key, format
 
 def print_metrics(title: str, metrics: dict[str, Any]) -> None:
     """Print what applies; a metric that is null shows as `-`."""
-    print_table(title, [(label, _text(metrics.get(key), form)) for label, key, form in _LINES])
+    print_table(title, [(label, _text(metrics.get(key), form)) for label, key, form in LINES])
 
 
 def _text(value: Any, form: str) -> str:

@@ -69,7 +69,7 @@ def counts(reports: Sequence[FrameReport]) -> dict[str, Any]:
         "tracked_fraction": used / len(reports) if reports else None,
         "keyframes": sum(report.is_keyframe for report in reports),
         "gaussians": reports[-1].gaussians if reports else 0,
-        "closures": reports[-1].closures if reports else None,
+        "closures": next((r.closures for r in reversed(reports) if r.closures is not None), None),  # skipped: unknown
         "stage_s": dict(stage_s),
     }
 
