@@ -36,7 +36,7 @@ def gain_between(
         frame = replace(frame, colour=np.clip(factor * frame.colour, 0.0, 1.0).astype(np.float32))
         keyframes.add(Keyframe(frame, inverse(source.pose(number)), Exposure(), np.eye(6)))
     T_pk = keyframes[0].T_cw @ inverse((np.eye(4) if turn is None else turn) @ keyframes[1].T_cw)
-    return relative_gain(keyframes.images(1), keyframes.images(0), T_pk, source.camera)
+    return relative_gain(keyframes[1], keyframes[0], T_pk, source.camera)
 
 
 @pytest.mark.parametrize("brightness", [0.7, 1.0, 1.2])

@@ -127,7 +127,7 @@ class GraphClosing:
             labels = world.keyframes[number].labels
             assert labels is not None  # closures are looked for only where planes are
             ids = planes.table.resolved(labels.ids)[labels.places]
-            return View(world.keyframes.images(number).depth_m, ids)
+            return View(world.keyframes[number].depth_m(), ids)
 
         return self._search.find(sightings, dict(enumerate(T_cw)), self._graph.relative, view).closures
 
@@ -136,8 +136,8 @@ class GraphClosing:
         if self._loops is None:
             return ()
         latest, poses = len(world.keyframes) - 1, dict(enumerate(T_cw))
-        images = world.keyframes.images(latest)
-        return self._loops.find(latest, images.colour, images.depth_m, poses, self._graph.relative).closures
+        keyframe = world.keyframes[latest]
+        return self._loops.find(latest, keyframe.colour(), keyframe.depth_m(), poses, self._graph.relative).closures
 
     def _motions(self, T_cw: NDArray[np.float64]) -> dict[int, Matrix4]:
         """Of all keyframes once one of them has moved enough to matter."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import overload
@@ -19,7 +18,7 @@ from tgslam.ops.normals import normals_of
 from tgslam.types import Exposure, Frame, Matrix4, Trajectory
 
 _DEPTH_UNIT_M = 0.0002  # TUM's and finer than any RGB-D sensor's: 16 bits reach 13.1 m
-_DECODED = 3  # keyframes of which images stay decoded: the latest, the one before, and one that is looked back at
+_DECODED = 2  # latest keyframes whose images stay decoded: everything that happens with a new one looks at these
 
 
 class Keyframe:
@@ -48,6 +47,7 @@ class Keyframe:
         self._depth = np.where(units <= limit, units, 0).astype(np.uint16)
         self._labels: PlaneLabels | None = None
         self._label_version = 0
+        self._decoded: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
 
     @property
     def T_cw(self) -> Matrix4:
@@ -82,12 +82,16 @@ class Keyframe:
             self._labels, self._label_version = labels, self._label_version + 1
 
     def colour(self) -> NDArray[np.float32]:
-        """[H, W, 3] RGB in [0, 1], decoded anew: see `Keyframes.images`."""
-        return self._colour.astype(np.float32) / np.float32(255.0)
+        """[H, W, 3] RGB in [0, 1]; to be read only."""
+        return self._decoded[0] if self._decoded else self._colour.astype(np.float32) / np.float32(255.0)
 
     def depth_m(self) -> NDArray[np.float32]:
-        """[H, W] m, 0 = none, decoded anew."""
-        return self._depth.astype(np.float32) * np.float32(_DEPTH_UNIT_M)
+        """[H, W] m, 0 = none; to be read only."""
+        return self._decoded[1] if self._decoded else self._depth.astype(np.float32) * np.float32(_DEPTH_UNIT_M)
+
+    def keep_decoded(self, keep: bool) -> None:
+        """Whether its images stay decoded, which takes 16 bytes a pixel: by default they are decoded at each use."""
+        self._decoded = (self.colour(), self.depth_m()) if keep else None
 
 
 class KeyframeImages:
@@ -123,13 +127,17 @@ class Keyframes(Sequence[Keyframe]):
         self._camera, self._noise = camera, noise
         self._all: list[Keyframe] = []
         self._T_wc: dict[int, Matrix4] = {}
-        self._decoded: OrderedDict[int, KeyframeImages] = OrderedDict()
+        self._images: KeyframeImages | None = None  # of the latest one, once somebody has asked for them
         self.version = 0  # grows whenever poses change
 
     def add(self, keyframe: Keyframe) -> int:
         """Take in the next keyframe; returns its number, from 0."""
         number = len(self._all)
         self._all.append(keyframe)
+        self._images = None
+        keyframe.keep_decoded(True)
+        for earlier in self._all[-_DECODED - 1 : -_DECODED]:
+            earlier.keep_decoded(False)
         self._T_wc[number] = inverse(keyframe.T_cw)
         return number
 
@@ -154,13 +162,12 @@ class Keyframes(Sequence[Keyframe]):
         """Camera-to-world poses."""
         return Trajectory(np.array([keyframe.timestamp_s for keyframe in self._all], np.float64), inverse(self.T_cw()))
 
-    def images(self, number: int) -> KeyframeImages:
-        """A keyframe's decoded images and what follows from them, kept for the last few that were asked for."""
-        images_ = self._decoded.pop(number, None) or KeyframeImages(self._all[number], self._camera, self._noise)
-        self._decoded[number] = images_
-        while len(self._decoded) > _DECODED:
-            self._decoded.popitem(last=False)
-        return images_
+    @property
+    def latest_images(self) -> KeyframeImages:
+        """The images of the latest keyframe, and what follows from them."""
+        if self._images is None:
+            self._images = KeyframeImages(self._all[-1], self._camera, self._noise)
+        return self._images
 
     @overload
     def __getitem__(self, number: int) -> Keyframe: ...

@@ -36,13 +36,13 @@ class DepthFusion:
         self._camera, self._noise, self._limit_sigmas, self._draw = camera, noise, limit_sigmas, draw
         self._overlap, self._levels = seeding.overlap, cell_levels(seeding, camera.width)
 
-    def fuse(self, world: Map, number: int, surface: Surface, kept: NDArray[np.bool_]) -> None:
-        """Take in keyframe `number`. surface: how the first N Gaussians stand to it; kept: [N] those to be moved."""
+    def fuse(self, world: Map, surface: Surface, kept: NDArray[np.bool_]) -> None:
+        """Take in the latest keyframe. surface: how the first N Gaussians stand to it; kept: [N] those to be moved."""
         use = surface.supported & kept
         rows = np.flatnonzero(use)
         if not len(rows):
             return
-        gaussians, images_, T_cw = world.gaussians, world.keyframes.images(number), world.keyframes[number].T_cw
+        gaussians, images_, T_cw = world.gaussians, world.keyframes.latest_images, world.keyframes[-1].T_cw
         at = use[surface.inside]
         u, v, z = surface.u[at], surface.v[at], surface.z[use]
         means, scales = gaussians.host("mean"), gaussians.host("log_scale")
@@ -57,7 +57,7 @@ class DepthFusion:
         evidence = np.where(agrees, block_px**2 / sigma_m**2, 0.0)
         fused, information, gain = fused_depth(z, gaussians.host("information")[rows], measured, evidence)
         gaussians.write("information", rows, information)
-        gaussians.write("carriers", rows, self._draw(gaussians.host("carriers")[rows], number, gain))
+        gaussians.write("carriers", rows, self._draw(gaussians.host("carriers")[rows], len(world.keyframes) - 1, gain))
         T_wc = inverse(T_cw)
         towards = images_.normals[v, u].astype(np.float64) @ T_wc[:3, :3].T
         gaussians.write("mean", rows, T_wc[:3, 3] + (fused / z)[:, None] * (means[rows] - T_wc[:3, 3]))

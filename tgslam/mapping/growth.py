@@ -53,7 +53,7 @@ class Growth:
         their shares of what it sees of them.
         """
         latest = len(world.keyframes) - 1
-        depth_m = world.keyframes.images(latest).depth_m
+        depth_m = world.keyframes[latest].depth_m()
         margin_per_m2 = self._config.insert_sigmas * self._noise.per_m2
         surface = Surface(depth_m, world.keyframes[latest].T_cw, self._camera, world.gaussians, margin_per_m2)
         for name, evidence in (("conflict", surface.seen_through), ("support", surface.supported)):
@@ -65,11 +65,10 @@ class Growth:
 
         surface: as `weigh` has returned it, with the map unchanged since. planes: what it shows of the PGIs.
         """
-        number = len(world.keyframes) - 1
-        images, T_cw = world.keyframes.images(number), world.keyframes[number].T_cw
+        images, T_cw = world.keyframes.latest_images, world.keyframes[-1].T_cw
         kept = ~self._disproved(world, images, surface)
         kept &= self._refined(world, images, surface, planes)
-        self._fusion.fuse(world, number, surface, kept)
+        self._fusion.fuse(world, surface, kept)
         world.gaussians.keep(np.append(kept, np.ones(world.gaussians.count - len(kept), bool)))
         self._insert(world, images, T_cw, planes)
 

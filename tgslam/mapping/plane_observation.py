@@ -37,7 +37,7 @@ class PlaneObserver:
     def observe(self, world: Map) -> PlanarPixels:
         """Match the latest keyframe's planes to the PGIs; it and earlier ones show what comes of that."""
         registry, number = _registry_of(world), len(world.keyframes) - 1
-        keyframe, depth_m = world.keyframes[number], world.keyframes.images(number).depth_m
+        keyframe, depth_m = world.keyframes[number], world.keyframes[number].depth_m()
         view = extract_planes(runtime.to_device(depth_m), self._camera, self._config, self._noise)
         view = registry.with_known_steps(view, depth_m, self._camera, keyframe.T_cw)
         observation = registry.observe(view, depth_m, self._camera, keyframe.T_cw, number)

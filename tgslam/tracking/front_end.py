@@ -51,7 +51,7 @@ class FrontEnd:
         if number and self._config.exposure == "gain":
             previous = keyframes[number - 1]
             T_pk = previous.T_cw @ inverse(keyframe.T_cw)
-            gain = relative_gain(keyframes.images(number), keyframes.images(number - 1), T_pk, self._camera)
+            gain = relative_gain(keyframe, previous, T_pk, self._camera)
             if gain is not None:
                 keyframe.expose(Exposure(gain * previous.exposure.gain))
         return keyframe
@@ -83,12 +83,11 @@ class FrontEnd:
 
     def _references(self, world: Map) -> list[Reference]:
         keyframes = world.keyframes
-        depth_m = keyframes.images(len(keyframes) - 1).depth_m
+        depth_m = keyframes[-1].depth_m()
         median_m = float(np.median(depth_m[depth_m > 0])) if depth_m.any() else 0.0
         chosen = references_of(keyframes.T_cw(), median_m, self._config.references)
         return [self._reference(world, number) for number in chosen]
 
     def _reference(self, world: Map, number: int) -> Reference:
-        keyframe, images = world.keyframes[number], world.keyframes.images(number)
-        planes_c = steadying_planes(world, number)
-        return Reference(images.colour, images.depth_m, keyframe.T_cw, keyframe.exposure, planes_c)
+        keyframe, planes_c = world.keyframes[number], steadying_planes(world, number)
+        return Reference(keyframe.colour(), keyframe.depth_m(), keyframe.T_cw, keyframe.exposure, planes_c)

@@ -44,7 +44,7 @@ def _least_held(world: Map, number: int) -> float:
     pixels = np.zeros(len(normals), np.int64)
     pixels[labels.ids[named]] = counts[named]
     pixels *= normals.any(axis=1)
-    measured = max(int(np.count_nonzero(world.keyframes.images(number).depth_m)), 1)
+    measured = max(int(np.count_nonzero(world.keyframes[number].depth_m())), 1)
     others = max(measured - int(pixels.sum()), 0)
     moments = np.einsum("n,ni,nj->ij", pixels, normals, normals)
     return (float(np.linalg.eigvalsh(moments)[0]) + others / 3.0) / measured
