@@ -17,6 +17,7 @@ import pytest
 
 from tests.fakes import FakeSource, FakeSystem, fake_read_ids, fake_render
 from tgslam.cli import engine, inputs, main
+from tgslam.config.loader import load
 from tgslam.evaluation.run_metrics import METRIC_KEYS
 from tgslam.output.trajectory_io import read_trajectory, write_trajectory
 
@@ -150,6 +151,22 @@ def test_the_format_is_told_from_the_folder(world: World, tmp_path: Path, capsys
     assert "configs/tum.yaml" in one_error_line(capsys)
     assert main(["run", "--input", "nowhere"]) == 2
     assert "no such folder" in one_error_line(capsys)
+
+
+def test_a_config_may_give_only_the_camera(world: World, tmp_path: Path) -> None:
+    """The format is told from the folder all the same."""
+    (tmp_path / "clip").mkdir()
+    for name in ("rgb.txt", "depth.txt"):
+        (tmp_path / "clip" / name).write_text("")
+    (tmp_path / "camera.yaml").write_text("dataset: {fx: 525, fy: 525, cx: 319.5, cy: 239.5}\n")
+    for number, arguments in enumerate([["camera.yaml"], ["--set", "dataset.fx=500"], ["base"]]):
+        world.system = FakeSystem()
+        assert main(["run", *arguments, "--input", "clip", "--output", f"run{number}"]) == 0
+        assert world.opened_with[-1] == ("tum", Path("clip"))
+    assert load(Path("run0/config.yaml")).dataset.fx == 525.0
+    world.system = FakeSystem()
+    assert main(["run", "camera.yaml", "--output", "scene"]) == 0
+    assert world.opened_with[-1] == ("synthetic", None)
 
 
 @pytest.mark.parametrize("arguments", [["synthetic"], ["--set", "dataset.format=synthetic"]])
