@@ -66,21 +66,21 @@ class Slam:
         return self._cues.ask(frame, result.T_cw, seen, result.measures["overlap"])
 
     def _map(self, frame: Frame, result: TrackingResult, record: FrameRecord) -> None:
-        """The frame becomes a keyframe. Each step needs what those before have done.
+        """The frame becomes a keyframe. The order matters: each step looks at what those before have left.
 
-        The map is weighed before planes are seen, since planes change nothing that it asks; it grows with the planes'
-        depth and ids, so these come first; Gaussians are tied to planes once they are there; the graph comes last, as
-        its motions carry all of that along.
+        What the keyframe was tracked against is read off the map before that changes. New Gaussians take depth and ids
+        of the planes, so planes are observed first, and Gaussians are tied to planes once all of them are there. The
+        graph comes last: its motions carry everything along.
         """
         with record.stage("map"):
-            keyframe = self.front_end.keyframe(frame, result, self.map)
-            surface, owners = self._growth.weigh(self.map)
+            keyframe = self.front_end.keyframe(frame, result, self.map)  # section 3.1: add it
+            surface, owners = self._growth.weigh(self.map)  # section 3.1: against what was it tracked?
             planes = self._planes.observe(self.map) if self._planes else None  # sections 3.2, 3.3, Eqs. 5 to 7
-            self._growth.grow(self.map, surface, planes)  # section 3.4
+            self._growth.grow(self.map, surface, planes)  # section 3.3: Gaussians, Eq. 1
             if self._planes and planes:
-                self._planes.label(self.map, planes)  # section 3.3, Eqs. 1 to 3
-            self._refinement.refine()  # section 3.4, Eq. 14
-        self._close(owners, record)  # section 3.3, structure closures
+                self._planes.label(self.map, planes)  # section 3.3: which of them are on which PGI, Eq. 2
+            self._refinement.refine()  # section 3.4: the window with its SGVs, Eq. 14
+        self._close(owners, record)  # section 3.4: pose graph, structure closures
         self._poses.add(frame.timestamp_s)
         seen = self.front_end.know(self.map)
         self._cues.reset(frame, keyframe.T_cw, seen, self.map.planes_seen_from(len(self.map.keyframes) - 1))

@@ -109,7 +109,7 @@ class ClosureExpert:
 
 @dataclass(frozen=True)
 class ClosureConfig:
-    """The pose graph over keyframes, and what planes seen again say to it (sections 3.3, 3.4)."""
+    """The pose graph over keyframes, and what planes seen again say to it (section 3.4)."""
 
     enabled: bool = setting(False, doc="Planes correct the keyframes' poses. Off: they stay where tracking put them.")
     formulation: str = setting(

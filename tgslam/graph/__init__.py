@@ -1,1 +1,1 @@
-"""The pose graph over keyframes, and the motions between keyframes far apart that correct it (sections 3.3, 3.4)."""
+"""The pose graph over keyframes, and the motions between keyframes far apart that correct it (section 3.4)."""

@@ -1,4 +1,4 @@
-"""The map grows with a keyframe (section 3.4): what it knows better goes, what it sees again is averaged, gaps fill."""
+"""The map grows with a keyframe (section 3.3): what it knows better goes, what it sees again is averaged, gaps fill."""
 
 from __future__ import annotations
 

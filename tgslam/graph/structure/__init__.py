@@ -1,1 +1,1 @@
-"""Structure closures (section 3.3): motions between keyframes, measured through the planes that both see."""
+"""Structure closures (section 3.4): motions between keyframes, measured through the planes that both see."""
