@@ -275,7 +275,7 @@ def test_a_gaussian_is_as_wide_as_its_cell_in_the_image(tilt_deg: int) -> None:
     tilt_rad = np.deg2rad(tilt_deg)
     new, cells = seeded_plane(tilt_rad)
     spread_px = np.sqrt(np.linalg.eigvalsh(projected_covariance(new, CAMERA)))
-    relative = spread_px / (CONFIG.overlap * cells.size_px[:, None])
+    relative = spread_px / (CONFIG.expert.gaussians.overlap * cells.size_px[:, None])
     towards = -new.mean / np.linalg.norm(new.mean, axis=1, keepdims=True)
     not_grazing = towards @ plane_normal(tilt_rad) > 0.26
     assert not_grazing.sum() > 40

@@ -93,7 +93,7 @@ class PruningSettings:
 class StepSizeSettings:
     """How far a step of refinement goes. All but colour_relaxation are rates of Adam: the size of a step."""
 
-    rate_mean_px: float = setting(0.15, 0.0, 10.0, doc="Of means, in px: this over the focal length is the step in m.")
+    rate_mean_px: float = setting(0.15, 0.0, 10.0, doc="Of means, px at a depth of 1 m.")
     rate_scale: float = setting(0.005, 0.0, 1.0, doc="Of scales, in their logarithm.")
     rate_rotation: float = setting(0.002, 0.0, 1.0, doc="Of rotations, in components of the unit quaternion.")
     rate_opacity: float = setting(0.03, 0.0, 10.0, doc="Of opacities, in their logit.")
