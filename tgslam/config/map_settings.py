@@ -85,7 +85,10 @@ class PruningSettings:
 
     prune_opacity: float = setting(0.05, 0.0, 1.0, doc="Gaussians of less opacity go.")
     prune_weight_px: float = setting(
-        0.05, 0.0, 1000.0, doc="Gaussians go whose blend weight, summed over the window's pixels, is less, px."
+        0.05,
+        0.0,
+        1000.0,
+        doc="Gaussians go whose blend weight, summed over the pixels of any view, has been less in all of them, px.",
     )
 
 
