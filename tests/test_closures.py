@@ -164,7 +164,7 @@ class TestCandidates:
         truth, views = self.world()
         T_ji = {k: truth[-1] @ inverse(T) for k, T in enumerate(truth[:-1])}
         found = candidates(views[-1], dict(enumerate(views[:-1])), T_ji, CONFIG)
-        assert len(found) == CONFIG.max_edges
+        assert len(found) == CONFIG.expert.edges.max_edges
         ages = [59 - c.keyframe for c in found]
         assert ages == sorted(ages, reverse=True) and ages[0] > 40 and CONFIG.closure_gap < ages[-1] < 20
         assert all(len(c.shared) >= 2 for c in found)
@@ -181,7 +181,7 @@ class TestCandidates:
         all_three = {k: planes[k] for k in range(3)}
         two = {k: planes[k] for k in range(2)}
         earlier = {0: two, 1: all_three, 2: two, 3: two}
-        config = ClosureConfig(max_edges=1, closure_gap=1)
+        config = changed(ClosureConfig(), max_edges=1, closure_gap=1)
         (best,) = candidates(all_three, earlier, dict.fromkeys(earlier, np.eye(4)), config)
         assert best.keyframe == 1 and best.shared == (0, 1, 2)
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import typing
+from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -134,18 +136,22 @@ def test_errors_of_expert_settings_lead_to_them() -> None:
     assert "`planes.expert` is a section" in message(None, "planes.expert=3")
 
 
-def names_in(section: Any) -> list[str]:
-    """Of all settings in a section and those below it."""
-    inner = {field.name: getattr(section, field.name) for field in dataclasses.fields(section)}
-    below = [name for value in inner.values() if dataclasses.is_dataclass(value) for name in names_in(value)]
-    return [name for name, value in inner.items() if not dataclasses.is_dataclass(value)] + below
+def declarations(section: Any) -> Iterator[tuple[str, type, str]]:
+    """(name, the dataclass that declares it, what it says of itself) of all settings and groups below a section."""
+    for field in dataclasses.fields(section):
+        value = getattr(section, field.name)
+        group = dataclasses.is_dataclass(value)
+        yield field.name, type(value) if group else type(section), "" if group else field.metadata["doc"]
+        if group:
+            yield from declarations(value)
 
 
-def test_a_setting_of_planes_has_a_name_of_its_own() -> None:
-    config = Config()
-    everything = names_in(config)
-    twice = {name for name in names_in(config.planes) + names_in(config.structure) if everything.count(name) > 1}
-    assert twice == {"enabled"}  # which means the same everywhere
+def test_no_name_has_two_meanings() -> None:
+    """A small dataclass that two sections share is one meaning; a section may be switched on, and have experts."""
+    meanings: dict[str, set[tuple[type, str]]] = defaultdict(set)
+    for name, owner, doc in declarations(Config()):
+        meanings[name].add((owner, doc))
+    assert {name for name, found in meanings.items() if len(found) > 1} == {"enabled", "expert"}
 
 
 @pytest.mark.parametrize(

@@ -14,12 +14,15 @@ import yaml
 
 from tests.test_layers import RANKS
 from tgslam import __version__
+from tgslam.config.schema import Config
+from tgslam.config.setting import settings_of
 from tools import markdown_block
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 README = CHECKOUT / "README.md"
 PAPER = CHECKOUT / "docs" / "paper.md"
-PAGES = [README, CHECKOUT / "CHANGELOG.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
+NOW = [README, *sorted((CHECKOUT / "docs").glob("*.md"))]  # say what is; the changelog also what was
+PAGES = [*NOW, CHECKOUT / "CHANGELOG.md"]
 EQUATIONS = range(1, 15)
 COMMANDS = [
     "python3 -m venv .venv && .venv/bin/pip install . && .venv/bin/tgslam run\n",
@@ -126,6 +129,36 @@ def test_the_page_on_architecture_has_every_part_in_its_row() -> None:
     for number, parts in re.findall(r"^\| (\d+) \| ([^|]+) \|", text, flags=re.MULTILINE):
         rows.setdefault(int(number), set()).update(re.findall(r"`(\w+)`", parts))
     assert rows == dict(enumerate((rank for rank in RANKS if rank != {"__main__"}), start=1))
+
+
+def in_backticks(page: Path) -> list[str]:
+    prose = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    return re.findall(r"`([^`\n]+)`", prose)
+
+
+def known_keys() -> set[str]:
+    """Dotted keys of all settings, and of the sections and groups that hold them."""
+    keys = {key for key, _ in settings_of(Config())}
+    return keys | {key[:at] for key in keys for at, letter in enumerate(key) if letter == "."}
+
+
+@pytest.mark.parametrize("page", NOW, ids=lambda page: page.name)
+def test_settings_that_a_page_names_are_settings(page: Path) -> None:
+    sections, keys = {key for key in known_keys() if "." not in key} - {"seed"}, known_keys()
+    text = page.read_text(encoding="utf-8")
+    given = [code.split()[0] for code in in_backticks(page)] + re.findall(r"--set[ =]([\w.]+)", text)
+    named = [re.split("[=:]", word)[0] for word in given if re.match(r"[a-z_]+\.[a-z_]+[a-z_0-9.]*(?:[=:]|$)", word)]
+    files = {".txt", ".json", ".glb", ".py"}
+    wrong = [key for key in named if key.split(".")[0] in sections and key not in keys]
+    assert [key for key in wrong if Path(key).suffix not in files] == []
+
+
+@pytest.mark.parametrize("page", NOW, ids=lambda page: page.name)
+def test_modules_that_a_page_names_exist(page: Path) -> None:
+    names = [code for code in in_backticks(page) if re.fullmatch(r"[\w/]+\.py", code)]
+    paths = [path for path in names if path.split("/")[0] in ("tgslam", "kernels", "tools", "tests", "docs", "configs")]
+    assert [path for path in paths if not (CHECKOUT / path).exists()] == []
+    assert not set(names) - set(paths), "in full, from the top of the checkout"
 
 
 def test_the_citation_names_the_software_and_the_paper() -> None:

@@ -198,3 +198,25 @@ def test_columns_of_gaussians_are_assigned_in_one_module() -> None:
     for name in (name for name in MODULES if parts(name) in SYSTEM and name != owner):
         assert not stored_attributes(MODULES[name], of_others=True) & columns, name
         assert not written_views(MODULES[name]), name
+
+
+def attributes(cls: ast.ClassDef) -> set[str]:
+    """Names that the body of a class assigns or annotates, and those that its methods assign to self."""
+    body = [statement for statement in cls.body if isinstance(statement, (ast.Assign, ast.AnnAssign))]
+    names = {n.id for s in body for n in ast.walk(s) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+    stored = (n for n in ast.walk(cls) if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store))
+    return names | {n.attr for n in stored if ast.unparse(n.value) == "self"}
+
+
+def test_classes_are_small() -> None:
+    paths = [path for folder in ("tgslam", "kernels", "tools") for path in sorted((CHECKOUT / folder).rglob("*.py"))]
+    nodes = [(path, n) for path in paths for n in ast.walk(ast.parse(path.read_text(encoding="utf-8")))]
+    classes = {f"{path.stem}.{n.name}": n for path, n in nodes if isinstance(n, ast.ClassDef)}
+    assert len(classes) > 200
+    assert {name: len(attributes(cls)) for name, cls in classes.items() if len(attributes(cls)) > 12} == {}
+    lines = {name: (cls.end_lineno or 0) - cls.lineno + 1 for name, cls in classes.items()}
+    assert {name: count for name, count in lines.items() if count > 200} == {}
+
+
+def test_the_system_fits_on_one_screen() -> None:
+    assert len((CHECKOUT / "tgslam" / "slam.py").read_text(encoding="utf-8").splitlines()) <= 130

@@ -233,7 +233,7 @@ class TestVerification:
     def test_views_of_one_place(self) -> None:
         truth = walk("room", 4, 8)
         for k, same in enumerate(self.compared("room", 4, 8), 1):
-            assert same is not None and same.inliers >= CONFIG.min_inliers and same.measured.rank == 6
+            assert same is not None and same.inliers >= CONFIG.expert.place.min_inliers and same.measured.rank == 6
             error = se3_log(same.measured.T_ji @ inverse(truth.motion(0, k)))
             assert np.linalg.norm(error[:3]) < MAX_RAD and np.linalg.norm(error[3:]) < MAX_M
 

@@ -36,7 +36,7 @@ def source() -> SyntheticSource:
 
 
 def make_mapper(source: SyntheticSource, **settings: Any) -> Mapper:
-    return Mapper(source.camera, MappingConfig(**settings))
+    return Mapper(source.camera, changed(MappingConfig(), **settings))
 
 
 def true_T_cw(source: SyntheticSource, index: int) -> NDArray[np.float64]:

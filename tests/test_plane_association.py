@@ -168,7 +168,7 @@ def corner() -> tuple[StructureCue, np.ndarray]:
     """A cue that has seen the corner, and the camera's pose."""
     stage, T_cw = corner_stage(), looking((-1.0, -1.0, 1.4), (1.5, 1.5, 0.6))
     stage.show(T_cw)
-    cue = StructureCue(PlanesConfig(cue_angle_rad=0.2, cue_distance_m=0.3, cue_ratio=0.5))
+    cue = StructureCue(changed(PlanesConfig(), cue_angle_rad=0.2, cue_distance_m=0.3, cue_ratio=0.5))
     cue.reset(stage.registry.instances.values(), T_cw)
     return cue, T_cw
 

@@ -189,7 +189,7 @@ def test_a_cell_across_an_oblique_step_is_not_plane(step_m):
     near = v - 120 > 0.4 * (u - 160)
     noise = SIGMA * np.random.default_rng(0).normal(size=near.shape)
     depth_m = 1.0 / (1.0 / np.where(near, 3.0 - step_m, 3.0) + noise)
-    grid = CellGrid.across(CAMERA, CONFIG.segmentation_cells_across)
+    grid = CellGrid.across(CAMERA, CONFIG.expert.segmentation.segmentation_cells_across)
     graph = planar_cells(runtime.to_device(np.float32(depth_m)), grid, SIGMA, LIMITS.cell_share, LIMITS.cell_sigmas)
     rows, columns = grid.shape
     share = near.reshape(rows, grid.cell_px, columns, grid.cell_px).mean(axis=(1, 3)).ravel()

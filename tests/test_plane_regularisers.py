@@ -74,7 +74,7 @@ def test_values_match_the_twin():
 
 @pytest.mark.parametrize("part", [*PARTS, "all"])
 def test_gradients_match_central_differences(part):
-    config = CONFIG if part == "all" else replace(CONFIG, **{f"omega_{p}": float(p == part) for p in PARTS})
+    config = CONFIG if part == "all" else changed(CONFIG, **{f"omega_{p}": float(p == part) for p in PARTS})
     case = scene()
     parameters, arguments = twin_arguments(*case, config)
     found, _ = evaluate(*case, config)
@@ -107,7 +107,7 @@ def test_no_planar_gaussian_gives_zero_not_nan():
 
 def test_size_does_not_matter_for_flatness():
     gaussians, planes, visible = scene()
-    config = replace(CONFIG, omega_normal=0.0, omega_distance=0.0)
+    config = changed(CONFIG, omega_normal=0.0, omega_distance=0.0)
     larger = replace(gaussians, log_scale=gaussians.log_scale + np.float32(2.0))
     small, large = (evaluate(g, planes, visible, config)[0]["log_scale"] for g in (gaussians, larger))
     np.testing.assert_allclose(large, small, rtol=1e-4, atol=1e-8)

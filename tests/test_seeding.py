@@ -26,7 +26,7 @@ SIGMA = 0.0015  # 1/m
 NOISE = SensorNoise(SIGMA)
 CAMERA = Camera(96, 72, 80.0, 80.0, 47.5, 35.5)
 LARGEST = 8  # px
-CONFIG = SeedingConfig(cells_across=CAMERA.width // LARGEST)
+CONFIG = SeedingConfig(largest_cells_across=CAMERA.width // LARGEST)
 
 
 def everywhere(depth_m: NDArray) -> NDArray[np.bool_]:
@@ -114,7 +114,7 @@ def test_cells_on_a_plane_grow_larger_and_ignore_a_trend_and_small_gaps() -> Non
     depth_m = np.full(v.shape, 2.0, np.float32)
     colour = np.repeat((0.2 + 0.004 * u)[..., None], 3, -1).astype(np.float32)
     ids = np.where(u < 64, 3, -1).astype(np.int32)
-    config = SeedingConfig(smallest_cell_px=2, cells_across=16, plane_cells_across=4)
+    config = SeedingConfig(smallest_cell_px=2, largest_cells_across=16, largest_plane_cells_across=4)
     sizes = cell_sizes(colour, depth_m, config, NOISE, ids)
     assert (sizes[:, :16] == 32).all()  # the plane, whose colour is plain but for its trend
     assert (sizes[:, 16:32] == 16).all()  # a large cell has no small ones beside it
@@ -129,7 +129,7 @@ def test_cells_on_a_plane_grow_larger_and_ignore_a_trend_and_small_gaps() -> Non
 
 @pytest.mark.parametrize(("width_px", "plain_px", "plane_px"), [(64, 2, 2), (320, 4, 8), (640, 8, 16), (1200, 16, 32)])
 def test_the_largest_cells_cover_the_same_angle_in_images_of_every_size(width_px, plain_px, plane_px) -> None:
-    config = SeedingConfig(smallest_cell_px=2, cells_across=80, plane_cells_across=40)
+    config = SeedingConfig(smallest_cell_px=2, largest_cells_across=80, largest_plane_cells_across=40)
     assert 2 ** cell_levels(config, width_px) == plain_px
     assert 2 ** cell_levels(config, width_px, on_planes=True) == plane_px
 
@@ -140,7 +140,9 @@ def test_large_cells_on_a_plane_keep_away_from_its_edges_and_texture() -> None:
     colour[60:62, 60:62] = 0.9
     ids = np.zeros(depth_m.shape, np.int32)
     ids[:, 96:] = -1
-    config = SeedingConfig(smallest_cell_px=2, cells_across=32, plane_cells_across=8)  # up to 4 and 16 px
+    config = SeedingConfig(
+        smallest_cell_px=2, largest_cells_across=32, largest_plane_cells_across=8
+    )  # up to 4 and 16 px
     sizes = np.repeat(np.repeat(cell_sizes(colour, depth_m, config, NOISE, ids), 2, 0), 2, 1)
     for y, x in np.argwhere(sizes == 16)[::7]:
         y, x = y // 16 * 16, x // 16 * 16
@@ -166,7 +168,7 @@ def test_gaussians_on_a_plane_know_it() -> None:
 def test_every_pixel_with_depth_is_covered_once(frame: tuple, smallest: int, levels: int) -> None:
     colour, depth_m, _ = frame
     across = max(round(depth_m.shape[1] / (smallest << (levels - 1))), 1)
-    config = SeedingConfig(smallest_cell_px=smallest, cells_across=across)
+    config = SeedingConfig(smallest_cell_px=smallest, largest_cells_across=across)
     cells = quadtree(colour, depth_m, everywhere(depth_m), config, NOISE)
     count = times_covered(cells, depth_m.shape)
     assert (count[depth_m > 0] == 1).all()
@@ -239,7 +241,7 @@ def test_the_sensors_noise_does_not_break_a_plane_up_and_twice_the_limit_does() 
     noise_m = SIGMA * depth_m**2 * rng.standard_normal(depth_m.shape)
     noisy = quadtree(grey(depth_m), depth_m + noise_m, everywhere(depth_m), CONFIG, NOISE)
     assert (noisy.size_px == LARGEST).mean() > 0.99
-    rough = depth_m + 2 * CONFIG.planar_sigmas * noise_m
+    rough = depth_m + 2 * CONFIG.expert.flatness.planar_sigmas * noise_m
     assert (quadtree(grey(depth_m), rough, everywhere(depth_m), CONFIG, NOISE).size_px < LARGEST).mean() > 0.99
 
 
@@ -273,7 +275,7 @@ def test_a_gaussian_is_as_wide_as_its_cell_in_the_image(tilt_deg: int) -> None:
     tilt_rad = np.deg2rad(tilt_deg)
     new, cells = seeded_plane(tilt_rad)
     spread_px = np.sqrt(np.linalg.eigvalsh(projected_covariance(new, CAMERA)))
-    relative = spread_px / (CONFIG.overlap * cells.size_px[:, None])
+    relative = spread_px / (CONFIG.expert.gaussians.overlap * cells.size_px[:, None])
     towards = -new.mean / np.linalg.norm(new.mean, axis=1, keepdims=True)
     not_grazing = towards @ plane_normal(tilt_rad) > 0.26
     assert not_grazing.sum() > 40
@@ -344,7 +346,7 @@ def test_gaussians_lie_flat_on_the_true_surfaces(source: SyntheticSource, index:
     thin = matrix_from_quat_wxyz(new.quat_wxyz[inside])[:, :, 2]
     assert np.abs((thin * plane[:, :3]).sum(1)).min() > np.cos(np.deg2rad(0.05))
     scale = np.exp(new.log_scale)
-    np.testing.assert_allclose(scale[:, 2], CONFIG.thickness * scale[:, :2].min(1), rtol=1e-4)
+    np.testing.assert_allclose(scale[:, 2], CONFIG.expert.gaussians.thickness * scale[:, :2].min(1), rtol=1e-4)
     assert (new.birth_keyframe == 7).all()
 
 

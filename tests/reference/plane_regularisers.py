@@ -41,7 +41,7 @@ def value(*arguments):
     """lambda_str E_str; arguments as of `parts`."""
     config, means = arguments[-1], parts(*arguments)
     return config.lambda_str * (
-        config.omega_flat * means["flat"]
-        + config.omega_normal * means["normal"]
-        + config.omega_distance * means["distance"]
+        config.expert.shape.omega_flat * means["flat"]
+        + config.expert.shape.omega_normal * means["normal"]
+        + config.expert.shape.omega_distance * means["distance"]
     )

@@ -97,12 +97,23 @@ class IcpSettings:
 
 
 @dataclass(frozen=True)
+class EdgeSettings:
+    """Between which keyframes there are structure closures; with formulation: closures or both."""
+
+    max_edges: int = setting(10, 1, 100, doc="Structure closures of a keyframe to earlier ones, at most.")
+    min_angle_rad: float = setting(
+        0.35, 0.01, 1.57, doc="Two keyframes must share planes whose normals differ by this, rad."
+    )
+
+
+@dataclass(frozen=True)
 class ClosureExpert:
     """What needs knowledge of the algorithm to be turned."""
 
     solving: SolvingSettings = field(default_factory=SolvingSettings)
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
     follow: FollowSettings = field(default_factory=FollowSettings)
+    edges: EdgeSettings = field(default_factory=EdgeSettings)
     icp: IcpSettings = field(default_factory=IcpSettings)
     acceptance: AcceptanceSettings = field(default_factory=AcceptanceSettings)
 
@@ -131,10 +142,6 @@ class ClosureConfig:
         doc="Keyframes that lie between two that are compared for their planes. Small planes are in view for a few "
         "only.",
     )
-    max_edges: int = setting(10, 1, 100, doc="Structure closures of a keyframe to earlier ones, at most.")
-    min_angle_rad: float = setting(
-        0.35, 0.01, 1.57, doc="Two keyframes must share planes whose normals differ by this, rad."
-    )
     expert: ClosureExpert = field(default_factory=ClosureExpert)
 
 
@@ -153,6 +160,9 @@ class FeatureSettings:
 class PlaceSettings:
     """What makes two keyframes views of one place."""
 
+    min_inliers: int = setting(
+        25, 6, 10_000, doc="Points that must agree on one motion, each at a place of its own in the image."
+    )
     min_inlier_share: float = setting(
         0.5, 0.0, 1.0, doc="Least part of the points that match by their looks that agree on one motion."
     )
@@ -217,7 +227,4 @@ class LoopConfig:
     features: int = setting(400, 50, 10_000, doc="Features that are kept of a keyframe, at most.")
     candidates: int = setting(4, 2, 100, doc="Earlier keyframes that a keyframe is compared with: the most alike.")
     loop_gap: int = setting(10, 1, 100_000, doc="Keyframes that lie between two that are compared for their looks.")
-    min_inliers: int = setting(
-        25, 6, 10_000, doc="Points that must agree on one motion, each at a place of its own in the image."
-    )
     expert: LoopExpert = field(default_factory=LoopExpert)

@@ -9,53 +9,140 @@ from tgslam.config.setting import setting
 
 
 @dataclass(frozen=True)
-class SeedingConfig:
-    """Gaussians from RGB-D."""
+class FlatnessSettings:
+    """When one Gaussian can stand for a cell of the quadtree, so that the cell is not split."""
 
-    smallest_cell_px: int = setting(2, 1, 64, doc="cells at edges, texture and off planes")
-    cells_across: int = setting(
-        80, 1, 10_000, doc="the image, about so many of the largest cells: doublings of the smallest"
+    plain_colour_std: float = setting(
+        0.015,
+        0.0,
+        1.0,
+        doc="A cell has no texture if its channels' standard deviations are less, intensity in [0, 1].",
     )
-    plane_cells_across: int = setting(40, 1, 10_000, doc="likewise on one plane (PGI)")
-    plain_colour_std: float = setting(0.015, 0.0, 1.0, doc="a cell whose channels vary less has no texture")
-    plane_colour_std: float = setting(0.022, 0.0, 1.0, doc="likewise for a cell on one plane, but for a linear trend")
+    plane_colour_std: float = setting(
+        0.022, 0.0, 1.0, doc="The same for a cell on one plane (PGI), whose colour may have a linear trend besides."
+    )
     planar_sigmas: float = setting(
-        2.5, 0.0, 100.0, doc="a cell whose plane residual is less, in sensor sigmas, is flat"
+        2.5, 0.0, 100.0, doc="A cell is flat if it strays from a plane by less, in standard deviations of the sensor."
     )
-    overlap: float = setting(0.6, 0.1, 3.0, doc="standard deviation of a Gaussian in cell sizes")
-    thickness: float = setting(0.1, 1e-3, 1.0, doc="standard deviation along the normal, relative to across")
-    opacity: float = setting(0.9, 0.01, 0.99)
+
+
+@dataclass(frozen=True)
+class NewGaussianSettings:
+    """The Gaussian that a cell gets."""
+
+    overlap: float = setting(0.6, 0.1, 3.0, doc="Standard deviation across the surface, in sides of the cell.")
+    thickness: float = setting(0.1, 1e-3, 1.0, doc="Standard deviation along the normal, as a part of that across.")
+    seed_opacity: float = setting(0.9, 0.01, 0.99, doc="Opacity at its centre.")
+
+
+@dataclass(frozen=True)
+class SeedingExpert:
+    """What needs knowledge of the algorithm to be turned."""
+
+    flatness: FlatnessSettings = field(default_factory=FlatnessSettings)
+    gaussians: NewGaussianSettings = field(default_factory=NewGaussianSettings)
+
+
+@dataclass(frozen=True)
+class SeedingConfig:
+    """Gaussians from a keyframe: one for each cell of a quadtree. Cells are large where the image is plain and flat.
+
+    Sizes of cells double from the smallest to the largest.
+    """
+
+    smallest_cell_px: int = setting(
+        2, 1, 64, doc="Side of the smallest cells in px. They are used at edges and where there is texture."
+    )
+    largest_cells_across: int = setting(80, 1, 10_000, doc="The largest cells in a row of the image, about so many.")
+    largest_plane_cells_across: int = setting(
+        40, 1, 10_000, doc="The same on one plane (PGI), where cells may be larger still."
+    )
+    expert: SeedingExpert = field(default_factory=SeedingExpert)
+
+
+@dataclass(frozen=True)
+class InsertionSettings:
+    """Where a keyframe adds Gaussians to the map."""
+
+    insert_opacity: float = setting(
+        0.6, 0.0, 1.0, doc="Gaussians are added where the rendered opacity of the map is less than this."
+    )
+    insert_sigmas: float = setting(
+        8.0,
+        0.0,
+        1000.0,
+        doc="Gaussians are added where the keyframe's surface stands in front of the map's by more than this, in "
+        "standard deviations of the sensor; up to this, a measurement supports the Gaussians there.",
+    )
+    coarse_factor: float = setting(
+        2.5, 1.0, 100.0, doc="Gaussians that are this many times larger than the keyframe asks for are seeded anew."
+    )
+
+
+@dataclass(frozen=True)
+class PruningSettings:
+    """Which Gaussians are removed after refinement."""
+
+    prune_opacity: float = setting(0.05, 0.0, 1.0, doc="Gaussians of less opacity go.")
+    prune_weight_px: float = setting(
+        0.05,
+        0.0,
+        1000.0,
+        doc="Gaussians go whose blend weight, summed over the pixels of any view, has been less in all of them, px.",
+    )
+
+
+@dataclass(frozen=True)
+class StepSizeSettings:
+    """How far a step of refinement goes. All but colour_relaxation are rates of Adam: the size of a step."""
+
+    rate_mean_px: float = setting(0.15, 0.0, 10.0, doc="Of means, px at a depth of 1 m.")
+    rate_scale: float = setting(0.005, 0.0, 1.0, doc="Of scales, in their logarithm.")
+    rate_rotation: float = setting(0.002, 0.0, 1.0, doc="Of rotations, in components of the unit quaternion.")
+    rate_opacity: float = setting(0.03, 0.0, 10.0, doc="Of opacities, in their logit.")
+    rate_colour: float = setting(0.01, 0.0, 1.0, doc="Of colours, intensity in [0, 1]; only with optimizer: adam.")
+    rate_pose: float = setting(0.0003, 0.0, 1.0, doc="Of keyframe poses, rad and m; only with refine_poses.")
+    colour_relaxation: float = setting(
+        0.7, 0.0, 1.9, doc="Part of the full step of colours that is taken; only with optimizer: relaxation."
+    )
+
+
+@dataclass(frozen=True)
+class MappingExpert:
+    """What needs knowledge of the algorithm to be turned."""
+
+    insertion: InsertionSettings = field(default_factory=InsertionSettings)
+    pruning: PruningSettings = field(default_factory=PruningSettings)
+    step_sizes: StepSizeSettings = field(default_factory=StepSizeSettings)
 
 
 @dataclass(frozen=True)
 class MappingConfig:
-    """Insertion, pruning and refinement of the map."""
+    """How the map is refined (section 3.4): on the window of latest keyframes, and on a few earlier ones."""
 
     optimizer: str = setting(
-        "relaxation", choices=("relaxation", "adam"), doc="how colours move; geometry moves by Adam"
+        "relaxation",
+        choices=("relaxation", "adam"),
+        doc="How colours move. relaxation: by a damped step to their best value. adam: by Adam, as geometry does with "
+        "either.",
     )
-    window: int = setting(6, 1, 1000, doc="latest keyframes refined together")
+    window: int = setting(6, 1, 1000, doc="Latest keyframes that are refined together.")
     anchors: str = setting(
-        "structure", choices=("structure", "random", "none"), doc="earlier ones that are refined with it"
+        "structure",
+        choices=("structure", "random", "none"),
+        doc="Earlier keyframes that are refined with the window, so that it does not leave them behind. structure: the "
+        "sparse global viewpoints, by the planes that they share; random ones without planes.",
     )
-    anchor_count: int = setting(2, 0, 1000, doc="SGVs, whose poses hold still")
-    iterations: int = setting(12, 0, 10_000, doc="views rendered and refined a keyframe")
-    final_iterations: int = setting(120, 0, 1_000_000, doc="after the last frame, over all keyframes; 0 = off")
+    anchor_count: int = setting(2, 0, 1000, doc="How many such earlier keyframes; their poses hold still.")
+    iterations: int = setting(12, 0, 10_000, doc="Steps of refinement at a keyframe, each on one view.")
+    final_iterations: int = setting(
+        120, 0, 1_000_000, doc="Steps of refinement after the last frame, over all keyframes; 0 = none."
+    )
     refine_poses: bool = setting(
-        False, doc="in the window; tracking has been the better judge since it knows references"
+        False,
+        doc="Poses of the window are refined with the map. Tracking against keyframes has been the better judge.",
     )
-    insert_opacity: float = setting(0.6, 0.0, 1.0, doc="the map does not explain a pixel that it covers less than this")
-    insert_sigmas: float = setting(8.0, 0.0, 1000.0, doc="nor one whose surface stands this far in front of the map's")
-    coarse_factor: float = setting(2.5, 1.0, 100.0, doc="Gaussians this much larger than needed are seeded anew, finer")
-    prune_opacity: float = setting(0.05, 0.0, 1.0)
-    prune_weight_px: float = setting(0.05, 0.0, 1000.0, doc="blend weight summed over the window's pixels")
-    rate_mean_px: float = setting(0.15, 0.0, 10.0, doc="Adam steps: pixels of the median depth")
-    rate_scale: float = setting(0.005, 0.0, 1.0, doc="in log scale")
-    rate_rotation: float = setting(0.002, 0.0, 1.0)
-    rate_opacity: float = setting(0.03, 0.0, 10.0, doc="in logit")
-    rate_colour: float = setting(0.01, 0.0, 1.0, doc="only with optimizer: adam")
-    rate_pose: float = setting(0.0003, 0.0, 1.0, doc="rad and m")
-    relaxation: float = setting(0.7, 0.0, 1.9, doc="of colours; 1 = the full step")
+    expert: MappingExpert = field(default_factory=MappingExpert)
 
 
 @dataclass(frozen=True)

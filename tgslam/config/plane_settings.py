@@ -14,6 +14,9 @@ from tgslam.config.setting import setting
 class SegmentationSettings:
     """How the cells of one depth image grow into segments. Sigmas are of the sensor's inverse depth at a pixel."""
 
+    segmentation_cells_across: int = setting(
+        80, 8, 1000, doc="Cells in a row of the image, from which segments grow; a cell has at least 4 px a side."
+    )
     cell_share: float = setting(0.5, 0.1, 1.0, doc="Share of a cell's pixels that must be measured.")
     cell_sigmas: float = setting(
         1.4, 0.1, 100.0, doc="Root mean square residual of a cell, in sigmas, beyond which it is not plane."
@@ -28,7 +31,7 @@ class SegmentationSettings:
         0.01,
         0.0,
         1.0,
-        doc="By how many metres of depth joining may shift planes beyond that, on a surface without steps: "
+        doc="By how much depth, in m, joining may shift planes beyond that, on a surface without steps: "
         "real surfaces stray from planes.",
     )
     piece_share: float = setting(
@@ -48,7 +51,7 @@ class SegmentationSettings:
         "beyond max_bend_m is not plane.",
     )
     max_bend_m: float = setting(
-        0.005, 1e-5, 1.0, doc="The same in metres of depth. A segment is not plane beyond both limits only."
+        0.005, 1e-5, 1.0, doc="The same in m of depth. A segment is not plane beyond both limits only."
     )
 
 
@@ -82,8 +85,8 @@ class ReliabilitySettings:
     reliable_width_cells: float = setting(
         3.5, 0.0, 1000.0, doc="Least width, in cells: what is narrower may be two strips of other surfaces."
     )
-    reliable_angle_rad: float = setting(0.01, 1e-5, 1.0, doc="Most standard deviation of its normal, in radians.")
-    reliable_offset_m: float = setting(0.005, 1e-5, 1.0, doc="Most standard deviation of its offset, in metres.")
+    reliable_angle_rad: float = setting(0.01, 1e-5, 1.0, doc="Most standard deviation of its normal, rad.")
+    reliable_offset_m: float = setting(0.005, 1e-5, 1.0, doc="Most standard deviation of its offset, m.")
     reliable_curvature: float = setting(
         0.5, 1e-3, 1000.0, doc="Most curvature, in 1/m: rounder surfaces fall into strips that look plane."
     )
@@ -99,6 +102,15 @@ class ReliabilitySettings:
 class AssociationSettings:
     """Which segments may show which PGI (Eqs. 5 to 7)."""
 
+    max_angle_rad: float = setting(
+        0.2, 0.01, 1.57, doc="theta_max of Eq. 5: angle between a segment and its PGI at most, rad."
+    )
+    max_distance_m: float = setting(
+        0.15, 0.001, 10.0, doc="Distance of a segment's centroid from the plane of its PGI at most, in m."
+    )
+    matching_weights: tuple[float, float, float] = setting(
+        (0.5, 0.5, 1.0), 0.0, 100.0, doc="w_theta, w_d and w_o of Eq. 7: of angle, offset and overlap of masks."
+    )
     max_offset_ratio: float = setting(
         0.1, 1e-3, 10.0, doc="delta_max of Eqs. 5 and 7: difference of offsets from the camera over the larger one."
     )
@@ -114,7 +126,7 @@ class AssociationSettings:
     lenient_iou: float = setting(
         0.5, 0.0, 1.0, doc="The same in the second round, for a pose that has jumped farther than expected."
     )
-    mask_width_px: int = setting(96, 16, 4096, doc="Width of the masks of Eq. 6 at most, in pixels.")
+    mask_width_px: int = setting(96, 16, 4096, doc="Width of the masks of Eq. 6, px, at most.")
 
 
 @dataclass(frozen=True)
@@ -144,12 +156,10 @@ class GapSettings:
 class UncertaintySettings:
     """How far views of one plane may differ."""
 
-    pose_sigma_rad: float = setting(
-        0.003, 0.0, 1.0, doc="Standard deviation of a keyframe's turn in the world, in radians."
-    )
+    pose_sigma_rad: float = setting(0.003, 0.0, 1.0, doc="Standard deviation of a keyframe's turn in the world, rad.")
     pose_sigma_m: float = setting(0.01, 1e-4, 1.0, doc="Standard deviation of a keyframe's place in the world, in m.")
     step_sigma_rad: float = setting(
-        0.001, 0.0, 1.0, doc="Standard deviation of the turn from one keyframe to the next, in radians."
+        0.001, 0.0, 1.0, doc="Standard deviation of the turn from one keyframe to the next, rad."
     )
     step_sigma_m: float = setting(
         0.003, 0.0, 1.0, doc="Standard deviation of the motion from one keyframe to the next, in m."
@@ -183,6 +193,21 @@ class LifetimeSettings:
 
 
 @dataclass(frozen=True)
+class CueSettings:
+    """The structure cue (section 3.1): when planes in view have drifted so far that a keyframe is due."""
+
+    cue_angle_rad: float = setting(
+        0.2, 0.0, 3.15, doc="tau_theta: a plane in view has drifted if it has turned by more, rad."
+    )
+    cue_distance_m: float = setting(
+        0.25, 0.0, 100.0, doc="tau_d: so it has if its distance from the camera has changed by more, m."
+    )
+    cue_ratio: float = setting(
+        0.5, 0.0, 1.0, doc="tau_ratio: a keyframe is due if more than this part of the planes has drifted."
+    )
+
+
+@dataclass(frozen=True)
 class PlanesExpert:
     """What needs knowledge of the algorithm to be turned."""
 
@@ -193,6 +218,7 @@ class PlanesExpert:
     gaps: GapSettings = field(default_factory=GapSettings)
     uncertainty: UncertaintySettings = field(default_factory=UncertaintySettings)
     lifetime: LifetimeSettings = field(default_factory=LifetimeSettings)
+    cue: CueSettings = field(default_factory=CueSettings)
 
 
 @dataclass(frozen=True)
@@ -201,30 +227,9 @@ class PlanesConfig:
 
     enabled: bool = setting(False, doc="Whether planes are looked for; false: the map knows nothing of them.")
     max_segments: int = setting(32, 1, 1000, doc="K: segments of a view that are kept, the largest ones.")
-    segmentation_cells_across: int = setting(
-        80, 8, 1000, doc="Cells in a row of the image, from which segments grow; a cell has at least 4 px a side."
-    )
     min_area_share: float = setting(0.003, 0.0, 1.0, doc="Least area of a segment, as a share of the image.")
-    max_angle_rad: float = setting(
-        0.2, 0.01, 1.57, doc="theta_max of Eq. 5: angle between a segment and its PGI at most, in radians."
-    )
-    max_distance_m: float = setting(
-        0.15, 0.001, 10.0, doc="Distance of a segment's centroid from the plane of its PGI at most, in m."
-    )
-    matching_weights: tuple[float, float, float] = setting(
-        (0.5, 0.5, 1.0), 0.0, 100.0, doc="w_theta, w_d and w_o of Eq. 7: of angle, offset and overlap of masks."
-    )
     confirm_views: int = setting(
         3, 2, 1000, doc="Views of an ambiguous segment that make it a PGI; one less if it is parallel to a wall."
-    )
-    cue_angle_rad: float = setting(
-        0.2, 0.0, 3.15, doc="tau_theta of the structure cue (section 3.1): turn of a plane in view, in radians."
-    )
-    cue_distance_m: float = setting(
-        0.25, 0.0, 100.0, doc="tau_d of the structure cue: change of a plane's distance from the camera, in m."
-    )
-    cue_ratio: float = setting(
-        0.5, 0.0, 1.0, doc="tau_ratio of the structure cue: a keyframe is due when more of the planes have drifted."
     )
     expert: PlanesExpert = field(default_factory=PlanesExpert)
 
@@ -281,6 +286,9 @@ class ReadingSettings:
 class RegulariserSettings:
     """Which shape and place E_str asks for (Eqs. 8, 9)."""
 
+    omega_flat: float = setting(1.0, 0.0, 100.0, doc="Weight in E_str of how thin Gaussians on planes are (Eq. 8).")
+    omega_normal: float = setting(0.3, 0.0, 100.0, doc="Weight in E_str of how they are turned (Eq. 9).")
+    omega_distance: float = setting(0.4, 0.0, 100.0, doc="Weight in E_str of their distance from the plane.")
     thinness: float = setting(0.1, 0.0, 1.0, doc="k of Eq. 8: least scale over the geometric mean of the others.")
     sigma_distance_m: float = setting(
         0.03, 1e-5, 1.0, doc="A Gaussian that is much farther than this from its plane, in m, is left where it is."
@@ -307,7 +315,4 @@ class StructureConfig:
         choices=("colour", "scalar"),
         doc="What a Gaussian carries of its plane's id: a colour of the palette (Eq. 2), or a scalar for comparison.",
     )
-    omega_flat: float = setting(1.0, 0.0, 100.0, doc="Weight in E_str of how thin Gaussians on planes are (Eq. 8).")
-    omega_normal: float = setting(0.3, 0.0, 100.0, doc="Weight in E_str of how they are turned (Eq. 9).")
-    omega_distance: float = setting(0.4, 0.0, 100.0, doc="Weight in E_str of their distance from the plane.")
     expert: StructureExpert = field(default_factory=StructureExpert)

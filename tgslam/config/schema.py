@@ -17,12 +17,10 @@ from tgslam.config.tracking_settings import KeyframeConfig, TrackingConfig
 
 
 @dataclass(frozen=True)
-class Config:
-    """The whole of a run's settings."""
+class SystemConfig:
+    """What the system itself reads: settings of how frames become poses, a map and planes."""
 
     seed: int = setting(0, 0, 2**31 - 1, doc="Seed of all that is random: two runs of one seed are equal.")
-    dataset: DatasetConfig = dataclasses.field(default_factory=DatasetConfig)
-    synthetic: SyntheticConfig = dataclasses.field(default_factory=SyntheticConfig)
     tracking: TrackingConfig = dataclasses.field(default_factory=TrackingConfig)
     keyframes: KeyframeConfig = dataclasses.field(default_factory=KeyframeConfig)
     seeding: SeedingConfig = dataclasses.field(default_factory=SeedingConfig)
@@ -32,4 +30,12 @@ class Config:
     structure: StructureConfig = dataclasses.field(default_factory=StructureConfig)
     closures: ClosureConfig = dataclasses.field(default_factory=ClosureConfig)
     loops: LoopConfig = dataclasses.field(default_factory=LoopConfig)
+
+
+@dataclass(frozen=True)
+class Config(SystemConfig):
+    """The whole of a run's settings: besides, where frames come from, and how the run is measured."""
+
+    dataset: DatasetConfig = dataclasses.field(default_factory=DatasetConfig)
+    synthetic: SyntheticConfig = dataclasses.field(default_factory=SyntheticConfig)
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)

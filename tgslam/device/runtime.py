@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import math
 import os
 from enum import Enum
@@ -47,16 +49,17 @@ def start(device: Device = Device.AUTO, threads: int = 0) -> Device:
         return wanted
     threads = threads or available_threads()
     speed_up_translation()
-    ti.init(
-        arch=ti.cuda if wanted is Device.CUDA else ti.cpu,
-        default_ip=ti.i32,
-        default_fp=ti.f32,
-        fast_math=True,
-        offline_cache=True,
-        unrolling_limit=0,
-        cpu_max_num_threads=threads,
-        log_level=ti.ERROR,
-    )
+    with contextlib.redirect_stdout(io.StringIO()):  # stdout is the user's, and Taichi prints a line there
+        ti.init(
+            arch=ti.cuda if wanted is Device.CUDA else ti.cpu,
+            default_ip=ti.i32,
+            default_fp=ti.f32,
+            fast_math=True,
+            offline_cache=True,
+            unrolling_limit=0,
+            cpu_max_num_threads=threads,
+            log_level=ti.ERROR,
+        )
     if wanted is Device.CUDA and ti.cfg.arch != ti.cuda:
         ti.reset()
         raise DeviceError("no CUDA device was found; use --device cpu, or check the driver with `nvidia-smi`")

@@ -18,7 +18,7 @@ class StructureCue:
     """Remembers the planes that the last keyframe saw, as they stood in its camera's frame."""
 
     def __init__(self, config: PlanesConfig) -> None:
-        self._config = config
+        self._settings = config.expert.cue
         self._normals_w: NDArray[np.float64] = np.zeros((0, 3))
         self._offsets_w: NDArray[np.float64] = np.zeros(0)
         self._T_cw: NDArray[np.float64] = np.eye(4)
@@ -43,9 +43,9 @@ class StructureCue:
         last_normals, last_offsets = _in_camera(self._normals_w, self._offsets_w, self._T_cw)
         angles = np.arccos(np.clip(np.sum(normals * last_normals, axis=1), -1.0, 1.0))
         changes = np.abs(offsets - last_offsets)
-        turned, shifted = angles > self._config.cue_angle_rad, changes > self._config.cue_distance_m
+        turned, shifted = angles > self._settings.cue_angle_rad, changes > self._settings.cue_distance_m
         drifted = int((turned | shifted).sum())
-        if drifted <= max(1.0, self._config.cue_ratio * count):
+        if drifted <= max(1.0, self._settings.cue_ratio * count):
             return ""
         return (
             f"structure: {drifted} of {count} planes drifted, {int(turned.sum())} in angle (up to "

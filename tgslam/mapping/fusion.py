@@ -34,7 +34,7 @@ class DepthFusion:
     ) -> None:
         """limit_sigmas: a measurement farther off, in standard deviations of the sensor, is of another surface."""
         self._camera, self._noise, self._limit_sigmas, self._draw = camera, noise, limit_sigmas, draw
-        self._overlap, self._levels = seeding.overlap, cell_levels(seeding, camera.width)
+        self._overlap, self._levels = seeding.expert.gaussians.overlap, cell_levels(seeding, camera.width)
 
     def fuse(self, world: Map, surface: Surface, kept: NDArray[np.bool_]) -> None:
         """Take in the latest keyframe. surface: how the first N Gaussians stand to it; kept: [N] those to be moved."""

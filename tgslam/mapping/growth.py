@@ -41,10 +41,10 @@ class Growth:
         structure: StructureConfig | None = None,
     ) -> None:
         """structure: how Gaussians carry the identity of their plane; None = they carry none."""
-        self._camera, self._config, self._seeding, self._noise = camera, mapping, seeding, noise
-        self._structure = structure
+        self._camera, self._insertion, self._seeding, self._noise = camera, mapping.expert.insertion, seeding, noise
+        self._structure, self._overlap = structure, seeding.expert.gaussians.overlap
         self._rasterizer = Rasterizer(camera)
-        self._fusion = DepthFusion(camera, noise, seeding, mapping.insert_sigmas, CarrierDraw(rng))
+        self._fusion = DepthFusion(camera, noise, seeding, self._insertion.insert_sigmas, CarrierDraw(rng))
 
     def weigh(self, world: Map) -> tuple[Surface, dict[int, float]]:
         """How the map stands to what the latest keyframe measured: its evidence for and against Gaussians is counted.
@@ -54,7 +54,7 @@ class Growth:
         """
         latest = len(world.keyframes) - 1
         depth_m = world.keyframes[latest].depth_m()
-        margin_per_m2 = self._config.insert_sigmas * self._noise.per_m2
+        margin_per_m2 = self._insertion.insert_sigmas * self._noise.per_m2
         surface = Surface(depth_m, world.keyframes[latest].T_cw, self._camera, world.gaussians, margin_per_m2)
         for name, evidence in (("conflict", surface.seen_through), ("support", surface.supported)):
             world.gaussians.write(name, slice(None), world.gaussians.host(name) + evidence)
@@ -91,7 +91,7 @@ class Growth:
         gaussians = world.gaussians
         whole = seen_whole(gaussians, surface, self._limit_px(images, planes))
         part = seen_in_part(gaussians, surface, _STEEPEST)
-        parts, of = halved(gaussians, np.flatnonzero(part), surface, _STEEPEST, 1.0 / self._seeding.overlap)
+        parts, of = halved(gaussians, np.flatnonzero(part), surface, _STEEPEST, 1.0 / self._overlap)
         share = 1.0 / np.bincount(of, minlength=len(part))[of]
         known = {name: gaussians.host(name)[of] for name in ("guessed", "support", "conflict", "carriers")}
         gaussians.append(parts, information=share * gaussians.host("information")[of], **known)
@@ -104,7 +104,7 @@ class Growth:
         sizes = cell_sizes(images.colour, depth_m, self._seeding, self._noise, ids)
         smallest = self._seeding.smallest_cell_px
         by_pixel = np.repeat(np.repeat(sizes, smallest, 0), smallest, 1)[: self._camera.height, : self._camera.width]
-        return self._config.coarse_factor * self._seeding.overlap * by_pixel.astype(np.float64)
+        return self._insertion.coarse_factor * self._overlap * by_pixel.astype(np.float64)
 
     def _insert(self, world: Map, images: KeyframeImages, T_cw: Matrix4, planes: PlanarPixels | None) -> None:
         """Seed Gaussians where the map is open; where no depth was measured, at a guessed one."""
@@ -131,9 +131,9 @@ class Growth:
         # The nearest surface around decides: where the map's depth bleeds over an edge, the edge is known all the same
         around = np.where(rendered.depth_m > 0, rendered.depth_m, np.float32(np.inf))
         nearest = cv2.erode(around, np.ones((5, 5)), borderValue=np.inf)
-        margin_m = self._config.insert_sigmas * self._noise.sigma_m(depth_m)
+        margin_m = self._insertion.insert_sigmas * self._noise.sigma_m(depth_m)
         in_front = np.isfinite(nearest) & (depth_m > 0) & (depth_m < nearest - margin_m)
-        return (rendered.opacity < self._config.insert_opacity) | in_front
+        return (rendered.opacity < self._insertion.insert_opacity) | in_front
 
 
 def _owners(born: NDArray[np.int32], latest: int) -> dict[int, float]:

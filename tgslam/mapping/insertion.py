@@ -55,7 +55,9 @@ def cell_sizes(
 
 def cell_levels(config: SeedingConfig, width_px: int, *, on_planes: bool = False) -> int:
     """Sizes of cells in an image of that width, each twice the one before: what counts is the angle that they cover."""
-    across = min(config.cells_across, config.plane_cells_across) if on_planes else config.cells_across
+    across = config.largest_cells_across
+    if on_planes:
+        across = min(across, config.largest_plane_cells_across)
     return 1 + max(round(math.log2(width_px / across / config.smallest_cell_px)), 0)
 
 
@@ -67,7 +69,7 @@ def _whole_cells(
     plane_ids: NDArray[np.int32] | None,
 ) -> list[NDArray[np.int32]]:
     """By level [rows, columns] of `ops.seeding`: the cells that one Gaussian can stand for, or that lie in such."""
-    device = runtime.to_device(colour), runtime.to_device(depth_m)
+    flatness, device = config.expert.flatness, (runtime.to_device(colour), runtime.to_device(depth_m))
     plain_levels = cell_levels(config, depth_m.shape[1])
     levels = plain_levels if plane_ids is None else cell_levels(config, depth_m.shape[1], on_planes=True)
     rows, columns = _tiles(depth_m, config, levels)
@@ -80,9 +82,9 @@ def _whole_cells(
             device_ids,
             (rows >> level, columns >> level),
             config.smallest_cell_px << level,
-            plain_std=config.plain_colour_std,
-            plane_std=config.plane_colour_std,
-            planar_rms=config.planar_sigmas * noise.per_m2,
+            plain_std=flatness.plain_colour_std,
+            plane_std=flatness.plane_colour_std,
+            planar_rms=flatness.planar_sigmas * noise.per_m2,
             on_planes_only=level >= plain_levels,
         )
         whole.append(cells)
@@ -250,15 +252,16 @@ def seed(
         length > 1e-3, across / np.maximum(length, 1e-12), helper / np.linalg.norm(helper, axis=-1, keepdims=True)
     )
     along = np.cross(normal, across)
-    footprint = config.overlap * cells.size_px * cells.depth_m / camera.fx
-    scale = np.stack([footprint, footprint / cosine, config.thickness * footprint], -1)
+    shape = config.expert.gaussians
+    footprint = shape.overlap * cells.size_px * cells.depth_m / camera.fx
+    scale = np.stack([footprint, footprint / cosine, shape.thickness * footprint], -1)
     T_wc = inverse(T_cw)
     axes = T_wc[:3, :3] @ np.stack([across, along, normal], -1)
     return Gaussians(
         mean=transform_points(T_wc, ray * cells.depth_m[:, None]).astype(np.float32),
         log_scale=np.log(scale).astype(np.float32),
         quat_wxyz=quat_wxyz_from_matrices(axes).astype(np.float32),
-        opacity_logit=np.full(n, np.log(config.opacity / (1.0 - config.opacity)), np.float32),
+        opacity_logit=np.full(n, np.log(shape.seed_opacity / (1.0 - shape.seed_opacity)), np.float32),
         colour=cells.colour.astype(np.float32),
         embedding=np.zeros((n, 3), np.float32),
         plane_id=ids.astype(np.int32),

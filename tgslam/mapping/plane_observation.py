@@ -65,7 +65,7 @@ class PlaneObserver:
         for plane_id, instance in registry.instances.items():
             named = rows[ids == plane_id]
             distance = np.abs(means[named] @ instance.normal_w + instance.offset_m)
-            plane_ids[named[distance < self._config.max_distance_m]] = plane_id
+            plane_ids[named[distance < self._config.expert.association.max_distance_m]] = plane_id
         _write_ids(gaussians, plane_ids)
 
     def complete(self, world: Map) -> None:

@@ -125,7 +125,7 @@ class Refiner:
         if self.config.optimizer == "relaxation":
             relaxation.relax(
                 gaussians.count, visible, gradient.colour, gradient.curvature, loss.totals,
-                colour_pace * self.config.relaxation, weight, gaussians.colour,
+                colour_pace * self.config.expert.step_sizes.colour_relaxation, weight, gaussians.colour,
             )  # fmt: skip
         rows.record_view(
             gaussians.count, visible, gradient.curvature, loss.totals, weight, gaussians.array("contribution"),
@@ -146,13 +146,13 @@ class Refiner:
 
 def _optimiser(config: MappingConfig, camera: Camera) -> Adam:
     """Adam for the geometry, and for colours unless they relax."""
-    channels = dict(_GEOMETRY)
+    channels, sizes = dict(_GEOMETRY), config.expert.step_sizes
     rates = {
-        "mean": config.rate_mean_px / camera.fx,
-        "log_scale": config.rate_scale,
-        "quat_wxyz": config.rate_rotation,
-        "opacity_logit": config.rate_opacity,
+        "mean": sizes.rate_mean_px / camera.fx,
+        "log_scale": sizes.rate_scale,
+        "quat_wxyz": sizes.rate_rotation,
+        "opacity_logit": sizes.rate_opacity,
     }
     if config.optimizer == "adam":
-        channels["colour"], rates["colour"] = 3, config.rate_colour
+        channels["colour"], rates["colour"] = 3, sizes.rate_colour
     return Adam(channels, rates)

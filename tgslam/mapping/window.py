@@ -51,7 +51,7 @@ class WindowRefinement:
         for view in _in_turn([*window, *self._anchors(window)], self._config.iterations):
             self._step(view, poses)
         self._move(poses)
-        prune(self._world.gaussians, self._config)
+        prune(self._world.gaussians, self._config.expert.pruning)
 
     def settle(self, motions: Mapping[int, Matrix4], ties: Iterable[tuple[int, int]]) -> None:
         """The map has followed keyframes that moved: where they have moved against each other, refine its seams.
@@ -74,7 +74,7 @@ class WindowRefinement:
         for view, pace in zip(views, np.linspace(1.0, _LAST_PACE, len(views)), strict=True):
             self._step(view, poses, float(pace))
         self._move(poses)
-        prune(self._world.gaussians, self._config)
+        prune(self._world.gaussians, self._config.expert.pruning)
 
     def finish(self) -> None:
         """The final pass: every keyframe in turn, in random order, poses fixed, until colours are the mean of views."""
@@ -83,7 +83,7 @@ class WindowRefinement:
         views = [k for _ in rounds for k in self._rng.permutation(len(keyframes))]
         for view, pace in zip(views, np.linspace(1.0, _FINAL_PACE, len(views)), strict=True):
             self.refiner.step(keyframes[view], colour_pace=float(pace))
-        prune(self._world.gaussians, self._config)
+        prune(self._world.gaussians, self._config.expert.pruning)
 
     def _know_planes(self) -> None:
         if self.refiner.structure and self._world.planes:
@@ -95,7 +95,7 @@ class WindowRefinement:
         T_cw = poses.get(view, keyframe.T_cw)
         g_pose = self.refiner.step(keyframe, T_cw, pace=pace).g_pose
         if self._may_move(view):
-            adam = self._pose_steps.setdefault(view, VectorAdam([self._config.rate_pose] * 6))
+            adam = self._pose_steps.setdefault(view, VectorAdam([self._config.expert.step_sizes.rate_pose] * 6))
             poses[view] = orthonormalized(se3_exp(adam.step(g_pose)) @ T_cw)
 
     def _move(self, poses: Mapping[int, Matrix4]) -> None:

@@ -35,7 +35,7 @@ class PlaneRegularisers:
         - normal, Eq. 9: 1 - |a . n|;
         - distance: Geman-McClure, h^2 / 2 / (1 + h^2), on h = (n . mean + d) / sigma_distance_m.
         """
-        config = self.config
+        config, shape = self.config, self.config.expert.shape
         require("planes", planes, (None, 4))
         require("visible", visible, (gaussians.count,), np.int32, at_least=True)
         if self._partial.shape[1] * kernels.BLOCK < gaussians.capacity:
@@ -45,9 +45,8 @@ class PlaneRegularisers:
         kernels.regularise(
             gaussians.count, visible, gaussians.plane_id, planes,
             gaussians.mean, gaussians.log_scale, gaussians.quat_wxyz,
-            config.lambda_str * config.omega_flat, config.lambda_str * config.omega_normal,
-            config.lambda_str * config.omega_distance,
-            config.expert.shape.thinness, config.expert.shape.sigma_distance_m, self._counted,
+            config.lambda_str * shape.omega_flat, config.lambda_str * shape.omega_normal,
+            config.lambda_str * shape.omega_distance, shape.thinness, shape.sigma_distance_m, self._counted,
             into.mean, into.log_scale, into.quat_wxyz, self._partial,
         )  # fmt: skip
 

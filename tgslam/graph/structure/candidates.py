@@ -38,7 +38,7 @@ def candidates(
     for other in sorted(earlier)[: -config.closure_gap]:
         found = _candidate(other, seen, earlier[other], T_ji[other], config)
         possible += [found] if found is not None else []
-    spans = np.array_split(np.arange(len(possible)), config.max_edges)
+    spans = np.array_split(np.arange(len(possible)), config.expert.edges.max_edges)
     return [max((possible[i] for i in span), key=lambda c: c.gain) for span in spans if len(span)]
 
 
@@ -57,6 +57,6 @@ def _candidate(
     shared, pairs = shared_planes(in_i, in_j)
     normals = pairs.in_j.normal
     sines = np.linalg.norm(np.cross(normals[:, None], normals[None]), axis=-1)
-    if sines.max() < np.sin(config.min_angle_rad):
+    if sines.max() < np.sin(config.expert.edges.min_angle_rad):
         return None
     return Candidate(keyframe, shared, information_gain(of_planes(pairs, T_ji), config.expert.acceptance))

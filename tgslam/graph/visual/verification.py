@@ -89,15 +89,15 @@ class Verification:
         """None unless the geometry speaks for one place beyond doubt."""
         config, place, limits = self._config, self._config.expert.place, self._config.expert.acceptance
         pairs = matches(look_i.features, look_j.features, config.expert.matching)
-        if len(pairs) < config.min_inliers:
+        if len(pairs) < place.min_inliers:
             return None
         points = self._points(look_i.features, look_j.features, pairs)
         T_ji, agree = self._sampled(points)
-        if agree.sum() < config.min_inliers:
+        if agree.sum() < place.min_inliers:
             return None
         measured = solve(partial(self._of_points, points[agree]), T_ji, limits, _FIRST_STEPS)
         agree = self._squares(points, measured.T_ji) < _INLIER_SIGMAS**2
-        if agree.mean() < place.min_inlier_share or self._places(points.seen_j[agree]) < config.min_inliers:
+        if agree.mean() < place.min_inlier_share or self._places(points.seen_j[agree]) < place.min_inliers:
             return None
         measured = solve(partial(self._of_points, points[agree]), measured.T_ji, limits)
         if measured.rank < 6 or agree.sum() < place.min_seen_again * self._in_both(look_i, look_j, measured.T_ji):

@@ -60,8 +60,9 @@ def gate(planes: PlaneEstimate, references: PlaneEstimate, position: Vector, con
     largest = np.maximum(np.maximum(np.abs(own_m), np.abs(reference_m)), _LEAST_OFFSET_M)
     distance = np.abs(references.heights_m(planes.centroid))
     deviation = deviation_sigmas(planes, references)
-    admitted = (angle <= config.max_angle_rad) & (distance <= config.max_distance_m)
-    admitted &= deviation <= config.expert.association.gate_sigmas
+    limits = config.expert.association
+    admitted = (angle <= limits.max_angle_rad) & (distance <= limits.max_distance_m)
+    admitted &= deviation <= limits.gate_sigmas
     return Agreement(angle, np.abs(own_m - reference_m) / largest, deviation, admitted)
 
 
@@ -97,8 +98,8 @@ def matching_cost(agreement: Agreement, iou: Vector, config: PlanesConfig) -> Ve
     limits = config.expert.association
     metric = agreement.deviation_sigmas / limits.gate_sigmas
     offset = np.minimum(np.maximum(agreement.offset_ratio / limits.max_offset_ratio, metric), 1.0)
-    w_theta, w_d, w_o = config.matching_weights
-    return w_theta * agreement.angle_rad / config.max_angle_rad + w_d * offset + w_o * (1.0 - iou)
+    w_theta, w_d, w_o = limits.matching_weights
+    return w_theta * agreement.angle_rad / limits.max_angle_rad + w_d * offset + w_o * (1.0 - iou)
 
 
 def assign(cost: Vector, allowed: Mask) -> list[tuple[int, int]]:

@@ -164,7 +164,7 @@ class Joining:
         for other in everything:
             if other is not a and other is not b and other.id != NO_ID:
                 heights_m = large.plane.heights_m(other.support.centres(other.support.cells()[0]))
-                behind_m2 += float(np.mean(heights_m < -self._config.max_distance_m)) * other.area_m2
+                behind_m2 += float(np.mean(heights_m < -self._config.expert.association.max_distance_m)) * other.area_m2
                 other_m2 += other.area_m2
         return other_m2 >= least_m2 and behind_m2 <= _BEHIND_SHARE * other_m2
 

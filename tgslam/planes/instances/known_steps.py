@@ -43,7 +43,7 @@ def with_known_steps(
     in_view = may_appear(samples, stacked([small.plane for small, _ in steps]), corners)
     least_px = config.expert.segmentation.piece_share * config.min_area_share * view.labels.size
     for small, large in (steps[i] for i in np.flatnonzero(in_view).tolist()):
-        place = _Place.of(samples, view, small, config.max_angle_rad, noise)
+        place = _Place.of(samples, view, small, config.expert.association.max_angle_rad, noise)
         step_m = float(large.plane.heights_m(small.plane.centroid))
         if place is None or not place.shows(step_m, config.expert.uncertainty.planarity_sigma_m, limits):
             continue

@@ -36,7 +36,7 @@ def extract_planes(depth_m: np.ndarray, camera: Camera, config: PlanesConfig, no
     (small, thin, grazing, rough) come with reliable=False.
     """
     limits, sigma = config.expert.segmentation, noise.per_m2
-    grid = CellGrid.across(camera, config.segmentation_cells_across)
+    grid = CellGrid.across(camera, limits.segmentation_cells_across)
     pieces, agreement = _pieces(depth_m, grid, config, sigma)
     if not len(pieces.moments):
         return PlaneView(np.full(camera.shape, -1, np.int32), ())
