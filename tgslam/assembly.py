@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from tgslam.camera import Camera
-from tgslam.config.schema import Config
+from tgslam.config.schema import SystemConfig
 from tgslam.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from tgslam.mapping.plane_observation import PlaneObserver
 
 
-def plane_observer(camera: Camera, config: Config) -> PlaneObserver | None:
+def plane_observer(camera: Camera, config: SystemConfig) -> PlaneObserver | None:
     """What looks for planes, None = nothing does. Its import takes 0.3 s, for SciPy."""
     if not config.planes.enabled:
         return None
@@ -22,7 +22,7 @@ def plane_observer(camera: Camera, config: Config) -> PlaneObserver | None:
     return PlaneObserver(camera, config.planes, config.loss.noise)
 
 
-def graph_closing(camera: Camera, config: Config) -> GraphClosing | None:
+def graph_closing(camera: Camera, config: SystemConfig) -> GraphClosing | None:
     """The pose graph with its closures, None = there is none. Raises ConfigError for closures without planes."""
     if not (config.closures.enabled or config.loops.enabled):
         return None
