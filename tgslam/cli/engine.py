@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import io
 from collections.abc import Sequence
 
 import numpy as np
@@ -31,8 +29,7 @@ def start_device(name: str, threads: int = 0) -> str:
     with quick_import():
         from tgslam.device.runtime import Device, start
 
-    with contextlib.redirect_stdout(io.StringIO()):  # Taichi prints a line that belongs to no result
-        return start(Device(name), threads).value
+    return start(Device(name), threads).value
 
 
 def make_system(camera: Camera, config: Config) -> System:
