@@ -22,7 +22,7 @@ HERE = looking((0.1, 1.0, 1.3), (0.0, 3.0, 1.1))
 
 def extents(stage: Stage, depth_m: np.ndarray) -> KnownExtents:
     rays = points_c(stage.camera, np.ones(depth_m.shape))
-    return KnownExtents(stage.registry.instances, depth_m, rays, HERE, PlanesConfig(), NOISE.per_m2)
+    return KnownExtents(stage.registry.instances, depth_m, rays, HERE, PlanesConfig(), NOISE)
 
 
 def test_pixels_without_a_segment_are_those_of_the_plane_they_lie_on() -> None:

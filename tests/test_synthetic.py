@@ -15,6 +15,7 @@ from tgslam.config.input_settings import DatasetConfig, SyntheticConfig
 from tgslam.config.loader import load
 from tgslam.datasets import open_source
 from tgslam.datasets.built_in import SyntheticSource
+from tgslam.datasets.detection import told_format
 from tgslam.datasets.tum import open_tum
 from tgslam.errors import ConfigError
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, se3_log, transform_points
@@ -245,7 +246,7 @@ def test_what_a_source_offers():
 
 
 def test_the_default_dataset_is_the_synthetic_room():
-    opened = open_source(DatasetConfig(), SyntheticConfig(), 0, None)
+    opened = open_source(told_format(DatasetConfig(), None), SyntheticConfig(), 0, None)
     assert isinstance(opened, SyntheticSource) and opened.name == "synthetic-room"
 
 
