@@ -156,10 +156,12 @@ def _normals(
 
 def _agreed(ids: NDArray[np.int32], group: NDArray[np.intp], count: NDArray[np.intp]) -> NDArray[np.int32]:
     """[G] the id that nearly all pixels [N] of each group show; -1 = none."""
-    result = np.full(len(count), -1, np.int32)
-    for known in np.unique(ids[ids >= 0]):
-        share = np.bincount(group[ids == known], minlength=len(count)) / count
-        result[share >= _AGREEING] = known
+    result, borne = np.full(len(count), -1, np.int32), ids >= 0
+    span = np.int64(ids.max(initial=0)) + 1
+    pairs, pixels = np.unique(group[borne] * span + ids[borne], return_counts=True)
+    of, known = np.divmod(pairs, span)
+    agreed = pixels / count[of] >= _AGREEING
+    result[of[agreed]] = known[agreed]
     return result
 
 

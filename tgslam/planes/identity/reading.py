@@ -34,7 +34,7 @@ class PlaneReader:
         self.config, self.noise = config, noise
         self.planes = sorted(planes, key=lambda plane: plane.id)
         self._outlines = [Outline(plane, config.expert.reading.read_margin_m) for plane in self.planes]
-        self._rays = camera.rays()
+        self._rays = camera.rays().reshape(-1, 3)
 
     def read(self, images: RenderImages, T_cw: Matrix4) -> NDArray[np.int32]:
         """The plane [H, W] that each pixel shows, -1 = none. images: a rendering from T_cw with its embedding."""
@@ -57,7 +57,7 @@ class PlaneReader:
         around = [ids[np.clip(rows + dy, 0, height - 1), np.clip(columns + dx, 0, width - 1)] for dy, dx in _AROUND]
         nearby = np.sort(np.stack([*around, np.full(len(rows), NO_ID, np.int32)], axis=1), axis=1)
         beside = nearby[:, -1] != NO_ID
-        rows, columns, nearby = rows[beside], columns[beside], nearby[beside]
+        rows, columns, nearby = rows[beside], columns[beside], _distinct(nearby[beside])
         result = ids.copy()
         result[rows, columns] = codes.unmixed(colours[rows, columns], nearby, self.config)
         return result
@@ -67,19 +67,38 @@ class PlaneReader:
 
         Nor have connected pixels an id if none of them is where that plane has been seen.
         """
-        result, T_wc, limits = np.full_like(ids, NO_ID), inverse(T_cw), self.config.expert.reading
-        for plane, outline in zip(self.planes, self._outlines, strict=True):
-            at = np.nonzero(ids == plane.id)
-            normal = T_cw[:3, :3] @ plane.normal_w
-            z = depth_m[at].astype(np.float64)
-            distance = np.abs(z * (self._rays[at] @ normal) + plane.offset_m - normal @ T_cw[:3, 3])
+        result, T_wc, limits = np.full(ids.size, NO_ID, np.int32), inverse(T_cw), self.config.expert.reading
+        pixels = np.flatnonzero(ids != NO_ID)
+        pixels = pixels[np.argsort(ids.ravel()[pixels], kind="stable")]  # plane after plane
+        ends = np.searchsorted(ids.ravel()[pixels], [plane.id for plane in self.planes], side="right")
+        for plane, outline, at in zip(self.planes, self._outlines, np.split(pixels, ends)[:-1], strict=True):
+            at = at[ids.ravel()[at] == plane.id]
+            if not len(at):
+                continue
+            normal, rays, z = T_cw[:3, :3] @ plane.normal_w, self._rays[at], depth_m.ravel()[at].astype(np.float64)
+            distance = np.abs(z * (rays @ normal) + plane.offset_m - normal @ T_cw[:3, 3])
             near = distance <= limits.read_distance_m + limits.read_sigmas * self.noise.per_m2 * z**2
-            rows, columns = at[0][near], at[1][near]
-            seen = outline.holds(transform_points(T_wc, self._rays[rows, columns] * z[near, None]))
+            at = at[near]
+            seen = outline.holds(transform_points(T_wc, rays[near] * z[near, None]))
             if not seen.all():
-                shown = np.zeros(ids.shape, np.uint8)
-                shown[rows, columns] = 1
-                part = cv2.connectedComponents(shown, connectivity=8)[1][rows, columns]
+                part = _connected(*np.divmod(at, ids.shape[1]))
                 seen = np.isin(part, part[seen])
-            result[rows[seen], columns[seen]] = plane.id
-        return result
+            result[at[seen]] = plane.id
+        return result.reshape(ids.shape)
+
+
+def _connected(rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.int32]:
+    """Which of the connected parts of an image [N] the pixels belong to that are set in it, one at least."""
+    rows, columns = rows - rows.min(), columns - columns.min()
+    shown = np.zeros((rows.max() + 1, columns.max() + 1), np.uint8)
+    shown[rows, columns] = 1
+    parts: NDArray[np.int32] = cv2.connectedComponents(shown, connectivity=8)[1][rows, columns]
+    return parts
+
+
+def _distinct(ids: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Rows [N, K] in ascending order without what they repeat, filled up with their last: [N, most of any row]."""
+    place = np.cumsum(np.diff(ids, axis=1, prepend=ids[:, :1]) != 0, axis=1)
+    result = np.repeat(ids[:, -1:], place.max(initial=0) + 1, axis=1)
+    np.put_along_axis(result, place, ids, axis=1)
+    return result
