@@ -17,7 +17,8 @@ from tgslam.device import runtime
 from tgslam.evaluation.image_metrics import masked_psnr
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, se3_exp, transform_points
 from tgslam.kernels import seeding as kernels
-from tgslam.mapping.insertion import Cells, cell_levels, cell_sizes, quadtree, seed
+from tgslam.mapping.insertion import seed
+from tgslam.mapping.quadtree import Cells, Quadtree, cell_levels
 from tgslam.ops.normals import normals_of
 from tgslam.ops.rasterize import Rasterizer
 from tgslam.types import Frame, Gaussians
@@ -27,6 +28,10 @@ NOISE = SensorNoise(SIGMA)
 CAMERA = Camera(96, 72, 80.0, 80.0, 47.5, 35.5)
 LARGEST = 8  # px
 CONFIG = SeedingConfig(largest_cells_across=CAMERA.width // LARGEST)
+
+
+def leaves(colour, depth_m, wanted, config, noise, ids=None) -> Cells:
+    return Quadtree(colour, depth_m, config, noise, ids).leaves(wanted)
 
 
 def everywhere(depth_m: NDArray) -> NDArray[np.bool_]:
@@ -115,16 +120,26 @@ def test_cells_on_a_plane_grow_larger_and_ignore_a_trend_and_small_gaps() -> Non
     colour = np.repeat((0.2 + 0.004 * u)[..., None], 3, -1).astype(np.float32)
     ids = np.where(u < 64, 3, -1).astype(np.int32)
     config = SeedingConfig(smallest_cell_px=2, largest_cells_across=16, largest_plane_cells_across=4)
-    sizes = cell_sizes(colour, depth_m, config, NOISE, ids)
+    sizes = Quadtree(colour, depth_m, config, NOISE, ids).sizes(depth_m > 0)
     assert (sizes[:, :16] == 32).all()  # the plane, whose colour is plain but for its trend
     assert (sizes[:, 16:32] == 16).all()  # a large cell has no small ones beside it
     assert (sizes[:, 32:] < 16).all()  # elsewhere as without planes
     wanted = np.zeros(v.shape, bool)
     wanted[:32, :20], wanted[40:42, 10:12] = True, True  # most of a large cell; a crumb
-    cells = quadtree(colour, depth_m, wanted, config, NOISE, ids)
+    cells = leaves(colour, depth_m, wanted, config, NOISE, ids)
     assert cells.size_px.tolist() == [32.0]
-    without = quadtree(colour, depth_m, wanted, config, NOISE)
+    without = leaves(colour, depth_m, wanted, config, NOISE)
     assert without.size_px.max() <= 8 and len(without.u) > 10
+
+
+def test_cells_where_depth_is_a_guess_count_as_small() -> None:
+    depth_m = np.full((64, 64), 2.0, np.float32)
+    sound = np.ones(depth_m.shape, bool)
+    sound[:, 40:44] = False
+    config = SeedingConfig(smallest_cell_px=2, largest_cells_across=8)
+    sizes = Quadtree(grey(depth_m), depth_m, config, NOISE).sizes(sound)
+    assert (sizes[:, 20:22] == 2).all() and (sizes[:, 22:24] == 4).all()
+    assert (sizes[:, :20] == 8).all() and (sizes[:, 24:] == 8).all()
 
 
 @pytest.mark.parametrize(("width_px", "plain_px", "plane_px"), [(64, 2, 2), (320, 4, 8), (640, 8, 16), (1200, 16, 32)])
@@ -143,7 +158,7 @@ def test_large_cells_on_a_plane_keep_away_from_its_edges_and_texture() -> None:
     config = SeedingConfig(
         smallest_cell_px=2, largest_cells_across=32, largest_plane_cells_across=8
     )  # up to 4 and 16 px
-    sizes = np.repeat(np.repeat(cell_sizes(colour, depth_m, config, NOISE, ids), 2, 0), 2, 1)
+    sizes = np.repeat(np.repeat(Quadtree(colour, depth_m, config, NOISE, ids).sizes(depth_m > 0), 2, 0), 2, 1)
     for y, x in np.argwhere(sizes == 16)[::7]:
         y, x = y // 16 * 16, x // 16 * 16
         around = sizes[max(y - 8, 0) : y + 24, max(x - 8, 0) : x + 24]
@@ -156,7 +171,7 @@ def test_gaussians_on_a_plane_know_it() -> None:
     depth_m = np.full((32, 32), 2.0, np.float32)
     ids = np.where(np.mgrid[:32, :32][1] < 16, 3, -1).astype(np.int32)
     camera = Camera(32, 32, 30.0, 30.0, 15.5, 15.5)
-    cells = quadtree(grey(depth_m), depth_m, everywhere(depth_m), CONFIG, NOISE, ids)
+    cells = leaves(grey(depth_m), depth_m, everywhere(depth_m), CONFIG, NOISE, ids)
     normals = np.zeros((32, 32, 3), np.float32)
     new = seed(cells, normals, camera, np.eye(4), 0, CONFIG, ids)
     assert set(new.plane_id[cells.u < 15]) == {3}
@@ -169,7 +184,7 @@ def test_every_pixel_with_depth_is_covered_once(frame: tuple, smallest: int, lev
     colour, depth_m, _ = frame
     across = max(round(depth_m.shape[1] / (smallest << (levels - 1))), 1)
     config = SeedingConfig(smallest_cell_px=smallest, largest_cells_across=across)
-    cells = quadtree(colour, depth_m, everywhere(depth_m), config, NOISE)
+    cells = leaves(colour, depth_m, everywhere(depth_m), config, NOISE)
     count = times_covered(cells, depth_m.shape)
     assert (count[depth_m > 0] == 1).all()
     assert count.max(initial=0) <= 1
@@ -180,7 +195,7 @@ def test_every_pixel_with_depth_is_covered_once(frame: tuple, smallest: int, lev
 @given(patchy_frames())
 def test_the_smallest_cells_that_are_wanted_by_half_are_covered_and_no_others(frame: tuple) -> None:
     colour, depth_m, wanted = frame
-    count = times_covered(quadtree(colour, depth_m, wanted, CONFIG, NOISE), depth_m.shape)
+    count = times_covered(leaves(colour, depth_m, wanted, CONFIG, NOISE), depth_m.shape)
     size = CONFIG.smallest_cell_px
     for y in range(0, depth_m.shape[0], size):
         for x in range(0, depth_m.shape[1], size):
@@ -195,7 +210,7 @@ def test_no_cell_hangs_between_two_surfaces(nearer_columns: int) -> None:
     """Whether the edge runs between cells or through them: of a cell that shows both surfaces one is taken."""
     depth_m = np.where(np.arange(CAMERA.width) < nearer_columns, 1.0, 3.0) * np.ones((CAMERA.height, 1))
     colour = np.where(depth_m[..., None] < 2.0, 0.2, 0.8) * np.ones(3)
-    cells = quadtree(colour, depth_m, everywhere(depth_m), CONFIG, NOISE)
+    cells = leaves(colour, depth_m, everywhere(depth_m), CONFIG, NOISE)
     np.testing.assert_allclose(np.minimum(abs(cells.depth_m - 1.0), abs(cells.depth_m - 3.0)), 0.0, atol=1e-6)
     np.testing.assert_allclose(cells.colour[:, 0], np.where(cells.depth_m < 2.0, 0.2, 0.8), atol=1e-6)
     assert (times_covered(cells, depth_m.shape) == 1).all()
@@ -209,7 +224,7 @@ def test_a_cell_shows_what_most_of_its_pixels_show() -> None:
     depth_m[0:2, 8:10] = [[2.0, 2.02], [2.0, 2.02]]
     rng = np.random.default_rng(3)
     colour = rng.random((*depth_m.shape, 3))  # the smallest cells everywhere
-    cells = quadtree(colour, depth_m, everywhere(depth_m), CONFIG, NOISE)
+    cells = leaves(colour, depth_m, everywhere(depth_m), CONFIG, NOISE)
     at = {(int(u) // 2, int(v) // 2): i for i, (u, v) in enumerate(zip(cells.u, cells.v, strict=True))}
     np.testing.assert_allclose(
         cells.depth_m[[at[0, 0], at[2, 0], at[4, 0]]], [2.0, 1.5, 2.0 / (1.0 - 0.005 / 1.01)], rtol=1e-4
@@ -219,8 +234,8 @@ def test_a_cell_shows_what_most_of_its_pixels_show() -> None:
 
 def test_nothing_wanted_or_no_depth_gives_no_cell() -> None:
     depth_m = plane_depth(0.0)
-    assert len(quadtree(grey(depth_m), depth_m, ~everywhere(depth_m), CONFIG, NOISE).u) == 0
-    empty = quadtree(grey(depth_m), 0 * depth_m, everywhere(depth_m), CONFIG, NOISE)
+    assert len(leaves(grey(depth_m), depth_m, ~everywhere(depth_m), CONFIG, NOISE).u) == 0
+    empty = leaves(grey(depth_m), 0 * depth_m, everywhere(depth_m), CONFIG, NOISE)
     normals = np.zeros((*depth_m.shape, 3))
     assert len(empty.u) == len(seed(empty, normals, CAMERA, np.eye(4), 0, CONFIG)) == 0
 
@@ -228,7 +243,7 @@ def test_nothing_wanted_or_no_depth_gives_no_cell() -> None:
 @pytest.mark.parametrize("tilt_rad", [0.0, 0.5, 0.9])
 def test_a_plain_plane_gives_the_largest_cells(tilt_rad: float) -> None:
     depth_m = plane_depth(tilt_rad)
-    cells = quadtree(grey(depth_m), depth_m, everywhere(depth_m), CONFIG, NOISE)
+    cells = leaves(grey(depth_m), depth_m, everywhere(depth_m), CONFIG, NOISE)
     assert (cells.size_px == LARGEST).all()
     # The mean of inverse depths is the plane's depth at the centre, which lies between pixels
     x = (cells.u - CAMERA.cx) / CAMERA.fx
@@ -239,10 +254,10 @@ def test_a_plain_plane_gives_the_largest_cells(tilt_rad: float) -> None:
 def test_the_sensors_noise_does_not_break_a_plane_up_and_twice_the_limit_does() -> None:
     depth_m, rng = plane_depth(0.4), np.random.default_rng(0)
     noise_m = SIGMA * depth_m**2 * rng.standard_normal(depth_m.shape)
-    noisy = quadtree(grey(depth_m), depth_m + noise_m, everywhere(depth_m), CONFIG, NOISE)
+    noisy = leaves(grey(depth_m), depth_m + noise_m, everywhere(depth_m), CONFIG, NOISE)
     assert (noisy.size_px == LARGEST).mean() > 0.99
     rough = depth_m + 2 * CONFIG.expert.flatness.planar_sigmas * noise_m
-    assert (quadtree(grey(depth_m), rough, everywhere(depth_m), CONFIG, NOISE).size_px < LARGEST).mean() > 0.99
+    assert (leaves(grey(depth_m), rough, everywhere(depth_m), CONFIG, NOISE).size_px < LARGEST).mean() > 0.99
 
 
 @pytest.mark.parametrize("what", ["texture", "step", "hole"])
@@ -259,7 +274,7 @@ def test_cells_are_small_at_texture_steps_and_holes_and_large_elsewhere(what: st
     else:
         depth_m[30:33, 40:45] = 0.0
         busy[29:34, 39:46] = True
-    cells = quadtree(colour, depth_m, everywhere(depth_m), CONFIG, NOISE)
+    cells = leaves(colour, depth_m, everywhere(depth_m), CONFIG, NOISE)
     for square, size in zip(squares(cells), cells.size_px, strict=True):
         if size > CONFIG.smallest_cell_px:
             assert (depth_m[square] > 0).all()
@@ -294,7 +309,7 @@ def test_a_surface_seen_at_grazing_angle_gives_no_needles() -> None:
 
 def seeded_plane(tilt_rad: float) -> tuple[Gaussians, Cells]:
     depth_m = plane_depth(tilt_rad)
-    cells = quadtree(grey(depth_m), depth_m, everywhere(depth_m) & (depth_m > 0) & (depth_m < 9), CONFIG, NOISE)
+    cells = leaves(grey(depth_m), depth_m, everywhere(depth_m) & (depth_m > 0) & (depth_m < 9), CONFIG, NOISE)
     normals = np.tile(plane_normal(tilt_rad), (*depth_m.shape, 1))
     return seed(cells, normals, CAMERA, np.eye(4), 0, CONFIG), cells
 
@@ -313,7 +328,7 @@ def projected_covariance(gaussians: Gaussians, camera: Camera) -> NDArray[np.flo
 
 def test_without_a_normal_gaussians_face_the_camera() -> None:
     depth_m = plane_depth(0.0)
-    cells = quadtree(grey(depth_m), depth_m, everywhere(depth_m), CONFIG, NOISE)
+    cells = leaves(grey(depth_m), depth_m, everywhere(depth_m), CONFIG, NOISE)
     new = seed(cells, np.zeros((*depth_m.shape, 3)), CAMERA, np.eye(4), 0, CONFIG)
     thin = matrix_from_quat_wxyz(new.quat_wxyz)[:, :, 2]
     towards = -new.mean / np.linalg.norm(new.mean, axis=1, keepdims=True)
@@ -326,7 +341,7 @@ def source() -> SyntheticSource:
 
 
 def seeded_frame(source: SyntheticSource, frame: Frame, T_cw: NDArray) -> tuple[Gaussians, Cells]:
-    cells = quadtree(frame.colour, frame.depth_m, everywhere(frame.depth_m), CONFIG, NOISE)
+    cells = leaves(frame.colour, frame.depth_m, everywhere(frame.depth_m), CONFIG, NOISE)
     normals = normals_of(frame.depth_m, source.camera, NOISE)
     return seed(cells, normals, source.camera, T_cw, 7, CONFIG), cells
 
@@ -368,7 +383,7 @@ def test_a_seeded_frame_looks_like_the_frame(source: SyntheticSource, index: int
 
 def test_means_are_in_the_world_frame() -> None:
     depth_m = plane_depth(0.0)
-    cells = quadtree(grey(depth_m), depth_m, everywhere(depth_m), CONFIG, NOISE)
+    cells = leaves(grey(depth_m), depth_m, everywhere(depth_m), CONFIG, NOISE)
     normals = np.tile(plane_normal(0.0), (*depth_m.shape, 1))
     T_cw = se3_exp([0.3, -0.2, 0.5, 0.4, -1.0, 2.0])
     here, there = (seed(cells, normals, CAMERA, T, 0, CONFIG) for T in (np.eye(4), T_cw))

@@ -17,7 +17,8 @@ from tgslam.device import runtime
 from tgslam.geometry import inverse
 from tgslam.map.gaussians import PARAMETERS, GaussianMap
 from tgslam.map.keyframes import Keyframe
-from tgslam.mapping.insertion import quadtree, seed
+from tgslam.mapping.insertion import seed
+from tgslam.mapping.quadtree import Quadtree
 from tgslam.mapping.refinement import Refiner
 from tgslam.mapping.structure_terms import StructureTerms
 from tgslam.planes.identity.codes import codes_of, initial_theta, read_ids
@@ -51,7 +52,8 @@ def true_planes(source: SyntheticSource) -> PlaneTable:
 def seeded(source: SyntheticSource) -> GaussianMap:
     """The first view's surface; the plane of each Gaussian is known, its embedding is neutral."""
     frame, view = source.read(0), true_keyframe(source, 0)
-    cells = quadtree(frame.colour, frame.depth_m, frame.depth_m > 0, SeedingConfig(), LossConfig().noise)
+    quadtree = Quadtree(frame.colour, frame.depth_m, SeedingConfig(), LossConfig().noise)
+    cells = quadtree.leaves(frame.depth_m > 0)
     gaussians = seed(cells, np.zeros((120, 160, 3)), source.camera, view.T_cw, 0, SeedingConfig())
     ids = source.labels(0)[np.rint(cells.v).astype(int), np.rint(cells.u).astype(int)]
     return GaussianMap.from_gaussians(replace(gaussians, plane_id=ids))

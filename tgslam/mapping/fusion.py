@@ -15,7 +15,7 @@ from tgslam.device import runtime
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, quat_product_wxyz
 from tgslam.map.world import Map
 from tgslam.mapping.carriers import CarrierDraw
-from tgslam.mapping.insertion import cell_levels
+from tgslam.mapping.quadtree import cell_levels
 from tgslam.mapping.surface import Surface
 from tgslam.ops import image as images
 
@@ -70,13 +70,7 @@ class DepthFusion:
         wanted_at: tuple[NDArray[np.float64], NDArray[np.float64]],
     ) -> NDArray[np.float64]:
         """Depth at one pixel over depth at another [N], on planes with those normals [N, 3]; 1 where it is unclear."""
-        camera = self._camera
-        seen, wanted = (
-            normals_c[:, 0] * (u - camera.cx) / camera.fx
-            + normals_c[:, 1] * (v - camera.cy) / camera.fy
-            + normals_c[:, 2]
-            for u, v in (seen_at, wanted_at)
-        )
+        seen, wanted = (np.sum(normals_c * self._camera.rays_at(u, v), -1) for u, v in (seen_at, wanted_at))
         ratio = seen / np.where(np.abs(wanted) > _MIN_COSINE, wanted, np.inf)
         return np.where(np.abs(ratio - 1.0) < _MAX_SLANT, ratio, 1.0)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from tgslam.camera import Camera, SensorNoise
 from tgslam.config.map_settings import MappingConfig, SeedingConfig
 from tgslam.config.plane_settings import StructureConfig
-from tgslam.map.keyframes import KeyframeImages
 from tgslam.map.world import Map
 from tgslam.mapping.carriers import CarrierDraw
 from tgslam.mapping.coarse import halved, seen_in_part, seen_whole
 from tgslam.mapping.fusion import DepthFusion
-from tgslam.mapping.insertion import cell_sizes, quadtree, seed
+from tgslam.mapping.insertion import seed
 from tgslam.mapping.planar_pixels import PlanarPixels
+from tgslam.mapping.quadtree import Quadtree
 from tgslam.mapping.surface import Surface
 from tgslam.ops.rasterize import Rasterizer
 from tgslam.planes.identity.codes import initial_theta
@@ -26,6 +26,16 @@ from tgslam.types import Matrix4
 _GUESS_SHARE = 0.8  # of a later guess of depth: an earlier one that is less is wrong
 _STEEPEST = 0.1  # deepest a Gaussian may be at the rim of the image, standard deviation over depth
 _OWNERS = 6  # keyframes at most
+
+
+@dataclass(frozen=True)
+class _Completed:
+    """The latest keyframe without holes, as Gaussians are seeded from it."""
+
+    quadtree: Quadtree  # of the colours as the map has them
+    sound: NDArray[np.bool_]  # [H, W] where depth was measured or a PGI seen, not guessed
+    normals_c: NDArray[np.float32]  # [H, W, 3] camera frame, towards the camera; 0 = unknown
+    plane_ids: NDArray[np.int32] | None  # [H, W] PGI of each pixel, -1 = none; None = no planes
 
 
 class Growth:
@@ -65,31 +75,42 @@ class Growth:
 
         surface: as `weigh` has returned it, with the map unchanged since. planes: what it shows of the PGIs.
         """
-        images, T_cw = world.keyframes.latest_images, world.keyframes[-1].T_cw
-        kept = ~self._disproved(world, images, surface)
-        kept &= self._refined(world, images, surface, planes)
+        completed = self._completed(world, planes)
+        kept = ~self._disproved(world, surface)
+        kept &= self._refined(world, surface, completed)
         self._fusion.fuse(world, surface, kept)
         world.gaussians.keep(np.append(kept, np.ones(world.gaussians.count - len(kept), bool)))
-        self._insert(world, images, T_cw, planes)
+        self._insert(world, completed)
 
-    def _disproved(self, world: Map, images: KeyframeImages, surface: Surface) -> NDArray[np.bool_]:
+    def _completed(self, world: Map, planes: PlanarPixels | None) -> _Completed:
+        """Where no depth was measured there is that of planes, and else a guess; the exposure is taken out."""
+        images, exposure = world.keyframes.latest_images, world.keyframes[-1].exposure
+        depth_m, normals_c, sound = images.guess.depth_m, images.guessed_normals, images.depth_m > 0
+        if planes:
+            sound |= planes.depth_m > 0
+            planes = planes.continued(images.guess.source, self._camera.rays())
+            depth_m = np.where((planes.depth_m > 0) & (images.depth_m <= 0), planes.depth_m, depth_m)
+            normals_c = np.where(planes.depth_m[..., None] > 0, planes.normals_c, normals_c)
+        ids = planes.ids if planes else None
+        colour = exposure.gain * images.colour + np.float32(exposure.bias)
+        return _Completed(Quadtree(colour, depth_m, self._seeding, self._noise, ids), sound, normals_c, ids)
+
+    def _disproved(self, world: Map, surface: Surface) -> NDArray[np.bool_]:
         """[N] guesses that the keyframe does better than: by a measurement, or by a guess of its own that is farther.
 
         What is beyond the sensor's range was put at its end; there it would hang before a camera that goes on.
         """
-        guess_m = images.guess.depth_m
+        guess_m = world.keyframes.latest_images.guess.depth_m
         nearer = np.zeros(len(surface.z), bool)
         nearer[surface.inside] = surface.z[surface.inside] < _GUESS_SHARE * guess_m[surface.v, surface.u]
         guessed: NDArray[np.bool_] = world.gaussians.host("guessed")
         return guessed & (surface.measured | nearer)
 
-    def _refined(
-        self, world: Map, images: KeyframeImages, surface: Surface, planes: PlanarPixels | None
-    ) -> NDArray[np.bool_]:
+    def _refined(self, world: Map, surface: Surface, completed: _Completed) -> NDArray[np.bool_]:
         """[N] false for Gaussians that are too large for the keyframe; parts of those that it cannot seed anew follow
         at the end of the map."""
         gaussians = world.gaussians
-        whole = seen_whole(gaussians, surface, self._limit_px(images, planes))
+        whole = seen_whole(gaussians, surface, self._limit_px(completed))
         part = seen_in_part(gaussians, surface, _STEEPEST)
         parts, of = halved(gaussians, np.flatnonzero(part), surface, _STEEPEST, 1.0 / self._overlap)
         share = 1.0 / np.bincount(of, minlength=len(part))[of]
@@ -97,28 +118,18 @@ class Growth:
         gaussians.append(parts, information=share * gaussians.host("information")[of], **known)
         return ~(whole | part)
 
-    def _limit_px(self, images: KeyframeImages, planes: PlanarPixels | None) -> NDArray[np.float64]:
-        """[H, W] the largest standard deviation that Gaussians may have in the keyframe's image."""
-        depth_m = np.where(planes.depth_m > 0, planes.depth_m, images.depth_m) if planes else images.depth_m
-        ids = planes.ids if planes else None
-        sizes = cell_sizes(images.colour, depth_m, self._seeding, self._noise, ids)
-        smallest = self._seeding.smallest_cell_px
+    def _limit_px(self, completed: _Completed) -> NDArray[np.float64]:
+        """[H, W] the largest standard deviation that Gaussians may have in the keyframe's image; small for guesses."""
+        sizes, smallest = completed.quadtree.sizes(completed.sound), self._seeding.smallest_cell_px
         by_pixel = np.repeat(np.repeat(sizes, smallest, 0), smallest, 1)[: self._camera.height, : self._camera.width]
         return self._insertion.coarse_factor * self._overlap * by_pixel.astype(np.float64)
 
-    def _insert(self, world: Map, images: KeyframeImages, T_cw: Matrix4, planes: PlanarPixels | None) -> None:
+    def _insert(self, world: Map, completed: _Completed) -> None:
         """Seed Gaussians where the map is open; where no depth was measured, at a guessed one."""
-        measured_m, exposure = images.depth_m, world.keyframes[-1].exposure
-        wanted = self._unexplained(world, T_cw, measured_m)
-        depth_m, normals_c = images.guess.depth_m, images.guessed_normals
-        colour = exposure.gain * images.colour + np.float32(exposure.bias)
-        if planes:
-            planes = planes.continued(images.guess.source, self._camera.rays())
-            depth_m = np.where((planes.depth_m > 0) & (measured_m <= 0), planes.depth_m, depth_m)
-            normals_c = np.where(planes.depth_m[..., None] > 0, planes.normals_c, normals_c)
-        ids = planes.ids if planes else None
-        cells = quadtree(colour, depth_m, wanted, self._seeding, self._noise, ids)
-        new = seed(cells, normals_c, self._camera, T_cw, len(world.keyframes) - 1, self._seeding, ids)
+        measured_m, T_cw = world.keyframes.latest_images.depth_m, world.keyframes[-1].T_cw
+        cells = completed.quadtree.leaves(self._unexplained(world, T_cw, measured_m))
+        latest, ids = len(world.keyframes) - 1, completed.plane_ids
+        new = seed(cells, completed.normals_c, self._camera, T_cw, latest, self._seeding, ids)
         if self._structure:
             new = replace(new, embedding=initial_theta(new.plane_id, self._structure))
         guessed = measured_m[np.rint(cells.v).astype(int), np.rint(cells.u).astype(int)] <= 0
