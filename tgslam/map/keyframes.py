@@ -89,6 +89,13 @@ class Keyframe:
         """[H, W] m, 0 = none; to be read only."""
         return self._decoded[1] if self._decoded else self._depth.astype(np.float32) * np.float32(_DEPTH_UNIT_M)
 
+    def pixels(
+        self, rows: NDArray[np.integer], columns: NDArray[np.integer]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The colours [..., 3] and depths [...] m at some pixels [...]; the images are not decoded for these."""
+        colour = self._colour[rows, columns].astype(np.float32) / np.float32(255.0)
+        return colour, self._depth[rows, columns].astype(np.float32) * np.float32(_DEPTH_UNIT_M)
+
     def keep_decoded(self, keep: bool) -> None:
         """Whether its images stay decoded, which takes 16 bytes a pixel: by default they are decoded at each use."""
         self._decoded = (self.colour(), self.depth_m()) if keep else None

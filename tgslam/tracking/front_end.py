@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 from tgslam.camera import Camera
 from tgslam.config.map_settings import LossConfig
 from tgslam.config.tracking_settings import TrackingConfig
-from tgslam.geometry import inverse
 from tgslam.map.keyframes import Keyframe
 from tgslam.map.world import Map
-from tgslam.tracking.brightness import relative_gain
+from tgslam.tracking.brightness import KeyframeExposures
 from tgslam.tracking.motion import MotionFilter
 from tgslam.tracking.references import Reference, references_of
 from tgslam.tracking.result import TrackingResult
@@ -29,7 +28,7 @@ class FrontEnd:
         self.tracker = make_tracker(camera, config, loss)
         self._camera, self._config = camera, config
         self._motion = MotionFilter(config.expert.motion)
-        self._exposure = Exposure()
+        self._exposure, self._exposures = Exposure(), KeyframeExposures(camera)
 
     def track(self, frame: Frame, world: Map, latest_T_cw: Matrix4) -> TrackingResult:
         """The frame's pose, from where motion leads; if that is lost, from the last frame at T_cw [4, 4] or from the
@@ -44,16 +43,11 @@ class FrontEnd:
         return self.tracker.rasterizer.visible(world.gaussians.count)
 
     def keyframe(self, frame: Frame, result: TrackingResult, world: Map) -> Keyframe:
-        """Add the tracked frame to the map's keyframes, as bright as the keyframe before shows the same surfaces."""
-        keyframes = world.keyframes
+        """Add the tracked frame to the map's keyframes, as bright as the others show the same surfaces."""
         keyframe = Keyframe(frame, result.T_cw, result.exposure, result.information)
-        number = keyframes.add(keyframe)
-        if number and self._config.exposure == "gain":
-            previous = keyframes[number - 1]
-            T_pk = previous.T_cw @ inverse(keyframe.T_cw)
-            gain = relative_gain(keyframe, previous, T_pk, self._camera)
-            if gain is not None:
-                keyframe.expose(Exposure(gain * previous.exposure.gain))
+        world.keyframes.add(keyframe)
+        if self._config.exposure == "gain":
+            self._exposures.add(world.keyframes)
         return keyframe
 
     def know(self, world: Map) -> NDArray[np.bool_]:
