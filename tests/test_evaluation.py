@@ -244,6 +244,18 @@ def test_psnr_of_known_errors() -> None:
     assert images.psnr(half, flat) == pytest.approx(40.0 + 10 * math.log10(8), abs=1e-3)
 
 
+def test_psnr_of_fitted_colours_does_not_see_gains_and_offsets_of_channels() -> None:
+    measured = 0.2 + 0.5 * picture(0)
+    other = ((measured - [0.1, 0.05, 0.0]) / [0.8, 1.0, 1.2]).astype(np.float32)
+    assert images.psnr(other, measured) < 30 and images.affine_psnr(other, measured) > 100
+    noise = 0.01 * np.sign(picture(1) - 0.5).astype(np.float32)
+    assert images.affine_psnr(other, measured + noise) == pytest.approx(40.0, abs=0.2)
+    assert images.affine_psnr(np.zeros_like(measured), measured) == pytest.approx(
+        -10 * math.log10(np.mean((measured - measured.mean((0, 1))) ** 2)), abs=1e-4
+    )
+    assert images.affine_psnr(measured + noise, measured) >= images.psnr(measured + noise, measured)
+
+
 def test_depth_l1_counts_pixels_with_both_depths() -> None:
     rendered = np.array([[1.0, 2.0, 0.0, 3.0]], np.float32)
     measured = np.array([[1.1, 0.0, 5.0, 2.7]], np.float32)
@@ -258,6 +270,7 @@ def test_scores_of_a_rendering_and_their_mean() -> None:
     score = images.score_rendering(noisy, frame)
     assert score.depth_l1_cm == pytest.approx(2.0, abs=1e-3)
     assert score.psnr_masked_db == pytest.approx(score.psnr_db) and 0 < score.ssim < 1
+    assert score.psnr_affine_db > score.psnr_db + 20
     blind = images.score_rendering(noisy, Frame(0, 0.0, colour, np.zeros_like(depth_m)))
     assert blind.depth_l1_cm is None and blind.psnr_masked_db is None
     mean = images.mean_scores([score, blind])

@@ -23,6 +23,7 @@ LINES = (  # label, key, format
     ("RPE, rotation", "rpe_rot_deg", "{:.3f} deg"),
     ("held-out frames", "heldout_frames", "{:d}"),
     ("PSNR", "psnr_db", "{:.2f} dB"),
+    ("PSNR, colours fitted", "psnr_affine_db", "{:.2f} dB"),
     ("PSNR, with depth", "psnr_masked_db", "{:.2f} dB"),
     ("SSIM", "ssim", "{:.4f}"),
     ("depth L1", "depth_l1_cm", "{:.2f} cm"),

@@ -22,6 +22,7 @@ class ImageScores:
     """Metrics of one rendering, or their means over several. None: there was no pixel to compare."""
 
     psnr_db: float
+    psnr_affine_db: float  # after the gain and offset of each channel that fit best
     psnr_masked_db: float | None  # over pixels with measured depth
     ssim: float
     depth_l1_cm: float | None  # over pixels with both depths
@@ -31,6 +32,7 @@ def score_rendering(rendering: Rendering, frame: Frame) -> ImageScores:
     """Compare a rendering with the frame at the same pose. Raises EvaluationError for images that do not fit."""
     return ImageScores(
         psnr_db=psnr(rendering.colour, frame.colour),
+        psnr_affine_db=affine_psnr(rendering.colour, frame.colour),
         psnr_masked_db=masked_psnr(rendering.colour, frame.colour, frame.depth_m > 0),
         ssim=ssim(rendering.colour, frame.colour),
         depth_l1_cm=depth_l1_cm(rendering.depth_m, frame.depth_m),
@@ -43,6 +45,7 @@ def mean_scores(scores: list[ImageScores]) -> ImageScores:
         raise EvaluationError("no frame to average image metrics over; lower evaluation.holdout_interval")
     return ImageScores(
         psnr_db=float(np.mean([score.psnr_db for score in scores])),
+        psnr_affine_db=float(np.mean([score.psnr_affine_db for score in scores])),
         psnr_masked_db=_mean([score.psnr_masked_db for score in scores]),
         ssim=float(np.mean([score.ssim for score in scores])),
         depth_l1_cm=_mean([score.depth_l1_cm for score in scores]),
@@ -55,6 +58,18 @@ def psnr(rendered: FloatImage, measured: FloatImage) -> float:
     Infinite for equal images. Raises EvaluationError for shapes that differ or values that are not finite.
     """
     return _psnr_db(_squared_error(rendered, measured))
+
+
+def affine_psnr(rendered: FloatImage, measured: FloatImage) -> float:
+    """Like `psnr`, after gain * rendered + offset with the gain and offset of each channel that make the error least.
+
+    So exposure and white balance, which differ from image to image of many recordings, do not count.
+    """
+    x, y = _prepared(rendered, measured)
+    x_off, y_off = x - x.mean((0, 1)), y - y.mean((0, 1))
+    variance = (x_off**2).sum((0, 1))
+    gain = (x_off * y_off).sum((0, 1)) / np.where(variance > 0, variance, 1.0)
+    return _psnr_db((gain * x_off - y_off) ** 2)
 
 
 def masked_psnr(rendered: FloatImage, measured: FloatImage, mask: NDArray[np.bool_]) -> float | None:

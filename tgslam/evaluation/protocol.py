@@ -1,8 +1,8 @@
 """The fixed protocol of every figure that tgslam reports: which frames are compared with what.
 
 Trajectory: SE(3)-aligned ATE over keyframes and over all frames, RPE over all frames. Images: every
-`holdout_interval`-th frame that is no keyframe, rendered at its estimated pose and full resolution, without any
-exposure compensation.
+`holdout_interval`-th frame that is no keyframe, rendered at its estimated pose and full resolution. Only the metric
+that says so in its name compensates for exposure.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Metrics = dict[str, float | None]
 Render = Callable[[Gaussians, Matrix4], Rendering]  # the map seen from T_cw
 
 TRAJECTORY_KEYS = ("ate_rmse_cm", "ate_rmse_all_cm", "rpe_trans_cm", "rpe_rot_deg")
-IMAGE_KEYS = ("psnr_db", "ssim", "lpips", "psnr_masked_db", "depth_l1_cm", "heldout_frames")
+IMAGE_KEYS = ("psnr_db", "psnr_affine_db", "ssim", "lpips", "psnr_masked_db", "depth_l1_cm", "heldout_frames")
 
 
 def is_held_out(frame_index: int, interval: int) -> bool:
