@@ -27,9 +27,10 @@ _CLIPPED = 0.03, 0.97  # intensities beyond are cut off, or nearly
 # Lambertian. What two surfaces in one view differ by says more, where it is more.
 _SYSTEMATIC = 0.03
 _SPREAD = 1.48  # standard deviation by median absolute deviation, of a normal distribution
-# By what gains differ from one keyframe to the next where the exposure is constant: hardly at all. The prior has the
-# tails of a Cauchy distribution, so a step that the views agree on costs next to nothing.
-_CONSTANT = 0.001
+# Steps of the log gain from one keyframe to the next that are much smaller count as none. Beyond, the prior is flat: it
+# does not shrink what the views agree on, and any step costs as much.
+_NO_STEP = 0.005
+_STEP_COST = 0.5  # negative log likelihood
 _TRACKED = 0.05  # of the gain that the tracker had against the map, for a keyframe that shares no surface with others
 _WINDOW = 100  # latest keyframes whose gains are still open; those of earlier ones have settled
 _ROUNDS = 20  # of reweighting
@@ -118,12 +119,12 @@ def gain_ratio(keyframe: Keyframe, other: Keyframe, camera: Camera) -> Ratio | N
 def solve(ties: Sequence[Tie], log_gains: NDArray[np.float64], first: int) -> NDArray[np.float64]:
     """The most likely log gains near those [K], from number `first` on; by iteratively reweighted least squares.
 
-    Errors of ties and steps between keyframes have Cauchy distributions: the former so that wrong ties do not count,
-    the latter so that steps are none or free.
+    The errors of ties have a Cauchy distribution, so that wrong ties do not count. Steps between keyframes are none or
+    free (the Geman-McClure function).
     """
     columns, steps = np.array(ties, np.float64).T, np.arange(first, len(log_gains))
     k, other = (np.concatenate([columns[i].astype(int), at]) for i, at in ((0, steps), (1, steps - 1)))
-    measured, sigma = (np.append(columns[i], np.full(len(steps), x)) for i, x in ((2, 0.0), (3, _CONSTANT)))
+    measured, sigma = (np.append(columns[i], np.full(len(steps), x)) for i, x in ((2, 0.0), (3, _NO_STEP)))
     gains = np.append(log_gains, 0.0)  # at -1 that of the map
     signs = np.concatenate([np.ones(len(k)), -np.ones(len(k))])
     ends, rows = np.concatenate([k, other]) - first, np.tile(np.arange(len(k)), 2)
@@ -131,7 +132,9 @@ def solve(ties: Sequence[Tie], log_gains: NDArray[np.float64], first: int) -> ND
     differences = csr_matrix((signs[free], (rows[free], ends[free])), shape=(len(k), len(steps)))
     for _ in range(_ROUNDS):
         error = measured - (gains[k] - gains[other])
-        weighted = differences.T.multiply(1.0 / (sigma**2 + error**2)).tocsc()
+        weight = 1.0 / (sigma**2 + error**2)
+        weight[-len(steps) :] = 2.0 * _STEP_COST * (_NO_STEP * weight[-len(steps) :]) ** 2
+        weighted = differences.T.multiply(weight).tocsc()
         change = spsolve((weighted @ differences).tocsc(), weighted @ error)
         gains[first:-1] += change
         if np.abs(change).max() < _CONVERGED:
