@@ -53,7 +53,7 @@ class _Runs:
 
     def sums(self, values: _Values) -> _Values:
         """[G] by cube, of the pixels' values [N]."""
-        return np.bincount(self.cube, np.add.reduceat(values, self._starts()) if len(values) else None)
+        return np.bincount(self.cube, np.add.reduceat(values, self._starts())).astype(np.float64)
 
     def any_of(self, values: _Values) -> _Values:
         """[G] the value of some pixel in each cube, of values [N]."""
@@ -122,9 +122,7 @@ def _agreed(ids: NDArray[np.int32], runs: _Runs, count: NDArray[np.int64]) -> ND
     return result
 
 
-def _normals(
-    points: _Values, corners: _Values, runs: _Runs, count: NDArray[np.int64], position: _Values
-) -> _Values:
+def _normals(points: _Values, corners: _Values, runs: _Runs, count: NDArray[np.int64], position: _Values) -> _Values:
     """[G, 3] unit normals of the points [3, N] of each cube, along which they scatter least, turned to `position` [3].
 
     Cubes whose points scatter as little in another direction, as points on a line do, have none: 0.

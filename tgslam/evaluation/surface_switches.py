@@ -1,27 +1,20 @@
 """Identity switches where nobody has labelled the scene: what measurements show at one place should keep its id.
 
-The measured points of a frame fall into patches: cubes of the world, each with the face of the cube that the surface
-there is turned to, so that the two sides of a thin wall are two patches. A patch bears the id that nearly all of its
-pixels show, if they show one. What bore one id when it was last seen is one surface; where enough of it bears another
-id now, that is a switch. What comes into view later, and follows switches that have been counted since it was last
-seen, is the same switch. Neither the ids' own planes nor how the map was made have a part in what a patch is.
+What bore one id when it was last seen is one surface; where enough of it bears another id now, that is a switch. What
+comes into view later, and follows switches that have been counted since it was last seen, is the same switch. The
+places are patches (see `patches`): neither the ids' own planes nor how the map was made have a part in what those are.
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.datasets.source import RgbdSource
-from tgslam.errors import FrameError
 from tgslam.evaluation.panoptic import IDENTITY_SHARE, SHOWN_SHARE, IdImage
 from tgslam.evaluation.patches import Patches, patches_of
-from tgslam.evaluation.plane_metrics import MIN_AREA_M2, Metrics, ReadIds
-from tgslam.geometry import inverse
-from tgslam.types import FloatImage, Gaussians, Matrix4
+from tgslam.evaluation.plane_metrics import MIN_AREA_M2
+from tgslam.types import FloatImage, Matrix4
 
 SURFACE_KEY = "plane_surface_switches_per_100"
 
@@ -89,26 +82,3 @@ class SurfaceSwitches:
             much = part_px >= IDENTITY_SHARE * seen_px or float(patches.areas_m2[part].sum()) >= MIN_AREA_M2
             if much and part_px >= SHOWN_SHARE * image_px:
                 self._switches.append((self.frames, known, int(other)))
-
-
-def surface_metrics(
-    source: RgbdSource,
-    poses: Sequence[tuple[int, Matrix4]],
-    gaussians: Gaussians,
-    read_ids: ReadIds,
-    stop_requested: Callable[[], bool] = lambda: False,
-) -> Metrics:
-    """The value of `SURFACE_KEY` over the frames at `poses` (position, T_wc), in order; null on a request to stop.
-
-    A frame that cannot be read is left out.
-    """
-    switches = SurfaceSwitches(source.camera)
-    for position, T_wc in poses:
-        if stop_requested():
-            return {SURFACE_KEY: None}
-        try:
-            depth_m = source.read(position).depth_m
-        except FrameError:  # has been told of with the image metrics
-            continue
-        switches.add(depth_m, read_ids(gaussians, inverse(T_wc)), T_wc)
-    return {SURFACE_KEY: switches.per_100_frames}

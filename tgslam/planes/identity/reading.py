@@ -77,7 +77,7 @@ class PlaneReader:
     def _extended(
         self, held: NDArray[np.int32], ids: NDArray[np.int32], depth_m: FloatImage, T_cw: Matrix4
     ) -> NDArray[np.int32]:
-        """What `on_planes` makes of ids [H, W], where what it makes of some of them is known: held [H, W], -1 = open."""
+        """What `on_planes` makes of ids [H, W]; where it is known already it is held [H, W], -1 = open."""
         result, T_wc, limits = held.copy(), inverse(T_cw), self.config.expert.reading
         pixels, ends = self._by_plane(np.where(held == NO_ID, ids, NO_ID).ravel())
         depths = depth_m.ravel()[pixels].astype(np.float64)
@@ -90,7 +90,8 @@ class PlaneReader:
                 continue
             at, seen = pixels[near], outline.holds(points_w.take(near, axis=1).T)
             if not seen.all():
-                seen = _connected(*np.divmod(at, ids.shape[1]), seen, held, plane.id)
+                rows, columns = np.divmod(at, ids.shape[1])
+                seen = _connected(rows, columns, seen, held, plane.id)
             result.ravel()[at[seen]] = plane.id
         return result
 
@@ -130,7 +131,7 @@ def _connected(
 
 
 def _distinct(ids: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
-    """Rows [N, K] in ascending order, each with what it repeats left out and its rest undefined; and their lengths [N]."""
+    """Rows [N, K] in ascending order without what they repeat, and how long they are [N]; what follows is undefined."""
     place = np.cumsum(np.diff(ids, axis=1, prepend=ids[:, :1]) != 0, axis=1)
     result = np.empty_like(ids)
     np.put_along_axis(result, place, ids, axis=1)
