@@ -9,6 +9,7 @@ import pytest
 
 from tests.fakes import FakeSource
 from tests.plane_views import Rectangle, cast, looking
+from tests.reference import patches as reference
 from tgslam.camera import Camera
 from tgslam.errors import FrameError
 from tgslam.evaluation.held_out import view_metrics
@@ -135,6 +136,23 @@ def test_patches_tell_the_area_that_they_show() -> None:
     assert patches.areas_m2.sum() == pytest.approx(expected, rel=0.05)
     assert (np.diff(patches.keys) > 0).all()
     assert set(patches.ids.tolist()) == {0}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_patches_are_their_definition(seed: int) -> None:
+    rng, T_cw = np.random.default_rng(seed), looking((0.4 - 0.3 * seed, -1.0, 1.5), (0.3, 1.4, 0.6))
+    depth_m, labels = cast(SCENE, CAMERA, T_cw)
+    depth_m = (depth_m + SIGMA_PER_M2 * depth_m**2 * rng.standard_normal(depth_m.shape)).astype(np.float32)
+    depth_m[rng.random(depth_m.shape) < 0.1] = 0.0
+    ids = np.where(rng.random(depth_m.shape) < 0.15, -1, labels).astype(np.int32)
+    expected = reference.patches_of(depth_m, ids, CAMERA, inverse(T_cw))
+    found = patches_of(depth_m, ids, CAMERA, inverse(T_cw))
+    *cube, face = (found.keys >> 41, found.keys >> 22 & (1 << 19) - 1, found.keys >> 3 & (1 << 19) - 1, found.keys & 7)
+    places = [tuple(place) for place in np.stack([*(axis - (1 << 18) for axis in cube), face], axis=1).tolist()]
+    assert set(places) == set(expected) and len(places) > 100
+    assert found.ids.tolist() == [expected[place][0] for place in places]
+    assert found.pixels.tolist() == [expected[place][1] for place in places]
+    assert found.areas_m2 == pytest.approx([expected[place][2] for place in places])
 
 
 def test_nothing_measured_is_no_surface() -> None:
