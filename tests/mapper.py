@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
+from tgslam.config.graph_settings import LoopConfig
 from tgslam.config.map_settings import LossConfig, MappingConfig, SeedingConfig
 from tgslam.config.plane_settings import PlanesConfig, StructureConfig
 from tgslam.map.gaussians import GaussianMap
@@ -35,7 +36,7 @@ class Mapper:
     ) -> None:
         mapping, loss, seeding = mapping or MappingConfig(), loss or LossConfig(), seeding or SeedingConfig()
         rng = np.random.default_rng(0)
-        self.camera, self.map = camera, Map(camera, loss.noise, planes)
+        self.camera, self.map = camera, Map(camera, loss.noise, LoopConfig(), planes)
         structure = structure if self.map.planes else None
         self._planes = PlaneObserver(camera, planes, loss.noise) if planes and self.map.planes else None
         self.refinement = WindowRefinement(self.map, camera, mapping, loss, rng, structure)

@@ -101,7 +101,7 @@ class Walk:
 
 
 def walked(config: ClosureConfig, seed: int, **settings: float) -> Walk:
-    walk, closing = Walk(seed, **settings), GraphClosing(CAMERA, NOISE, config, LoopConfig())
+    walk, closing = Walk(seed, **settings), GraphClosing(CAMERA, NOISE, config, LoopConfig(enabled=False))
     for _ in walk.truth:
         walk.add(closing)
     return walk
@@ -133,7 +133,9 @@ def test_where_everything_is_right_nothing_moves() -> None:
 
 def test_small_corrections_wait_until_they_add_up() -> None:
     walk = Walk(1)
-    closing = GraphClosing(CAMERA, 0.0015, changed(CONFIG, least_shift_m=0.02, least_turn_rad=0.02), LoopConfig())
+    closing = GraphClosing(
+        CAMERA, 0.0015, changed(CONFIG, least_shift_m=0.02, least_turn_rad=0.02), LoopConfig(enabled=False)
+    )
     moved = []
     for _ in walk.truth:
         before = [k.T_cw for k in walk.keyframes]
@@ -147,7 +149,7 @@ def test_small_corrections_wait_until_they_add_up() -> None:
 
 
 def test_what_refinement_changes_between_corrections_is_kept() -> None:
-    walk, closing = Walk(2), GraphClosing(CAMERA, NOISE, CONFIG, LoopConfig())
+    walk, closing = Walk(2), GraphClosing(CAMERA, NOISE, CONFIG, LoopConfig(enabled=False))
     for _ in range(10):
         walk.add(closing)
     nudged, untouched = walk.keyframes[4].T_cw.copy(), walk.keyframes[4].T_cw
@@ -159,7 +161,7 @@ def test_what_refinement_changes_between_corrections_is_kept() -> None:
 
 
 def test_planes_that_merge_are_one_landmark_from_then_on() -> None:
-    walk, closing = Walk(3), GraphClosing(CAMERA, NOISE, CONFIG, LoopConfig())
+    walk, closing = Walk(3), GraphClosing(CAMERA, NOISE, CONFIG, LoopConfig(enabled=False))
     first, other = sorted({i for seen in walk.seen for i in seen})[:2]
     for k, seen in enumerate(walk.seen):
         if k < 20 and first in seen:
@@ -192,7 +194,7 @@ def test_refinement_and_planes_that_disagree_do_not_drive_graph_and_map_apart() 
     rng, box = np.random.default_rng(0), Box((4.0, 2.5, 5.0))
     tracked = inverse(se3_exp([0.0, 0.0, 0.0, 2.0, 1.2, 1.0]))
     askew = se3_exp([0.005, 0.0, 0.0, 0.0, 0.0, 0.0])
-    closing, planes = GraphClosing(CAMERA, NOISE, CONFIG, LoopConfig()), Planes()
+    closing, planes = GraphClosing(CAMERA, NOISE, CONFIG, LoopConfig(enabled=False)), Planes()
     world = SimpleNamespace(keyframes=Keyframes(CAMERA, NOISE), planes=planes)
     for k in range(40):
         world.keyframes.add(blank_keyframe(k, tracked, 1e6 * np.eye(6)))
@@ -206,7 +208,7 @@ def test_refinement_and_planes_that_disagree_do_not_drive_graph_and_map_apart() 
 def test_closures_tie_keyframes_once_they_move_something() -> None:
     """Before, closures have said nothing that the map does not."""
     config = changed(CONFIG, formulation="closures", least_shift_m=0.02, least_turn_rad=0.02)
-    walk, closing = Walk(0), GraphClosing(CAMERA, NOISE, config, LoopConfig())
+    walk, closing = Walk(0), GraphClosing(CAMERA, NOISE, config, LoopConfig(enabled=False))
     close, corrections = closing.close, []
     closing.close = lambda *arguments: corrections.append(close(*arguments)) or corrections[-1]  # type: ignore[method-assign]
     for _ in walk.truth:

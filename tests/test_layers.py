@@ -16,9 +16,10 @@ CHECKOUT = Path(__file__).resolve().parents[1]
 RANKS = (
     {"camera", "errors", "geometry", "pixels", "types"},
     {"config", "configs", "files", "kernels"},
-    {"device"},
+    {"device", "relative_motion"},
     {"ops"},
     {"planes", "synthetic"},
+    {"recognition"},
     {"map"},
     {"boundary", "graph", "keyframing", "mapping", "preparation", "tracking"},
     {"assembly", "datasets", "record", "slam"},
@@ -31,7 +32,7 @@ RANKS = (
 RANKED = {name: rank for rank, names in enumerate(RANKS) for name in names}
 # What must never see ground truth
 SYSTEM = {"assembly", "boundary", "preparation", "record", "slam"}
-SYSTEM |= {"graph", "keyframing", "map", "mapping", "planes", "tracking"}
+SYSTEM |= {"graph", "keyframing", "map", "mapping", "planes", "recognition", "tracking"}
 # Rooms that hold kernels' arguments themselves; all others go through `ops`
 KERNEL_USERS = {"kernels", "ops", "synthetic", "bench"}
 

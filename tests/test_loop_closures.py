@@ -18,11 +18,12 @@ from tgslam.datasets.built_in import SyntheticSource, synthetic_camera
 from tgslam.geometry import inverse, se3_exp, se3_log
 from tgslam.graph.findings import Findings
 from tgslam.graph.pose_graph import PoseGraph
-from tgslam.graph.visual.depth_agreement import DepthGrid, agreement
-from tgslam.graph.visual.features import Detector, Features, matches
 from tgslam.graph.visual.loop_search import LoopSearch
-from tgslam.graph.visual.retrieval import Retrieval
-from tgslam.graph.visual.verification import Look, Sameness, Verification
+from tgslam.recognition.depth_agreement import DepthGrid, agreement
+from tgslam.recognition.features import Detector, Features, matches
+from tgslam.recognition.looks import Looks
+from tgslam.recognition.retrieval import Retrieval
+from tgslam.recognition.verification import Look, Sameness, Verification
 from tgslam.synthetic.sensor import DEPTH_SIGMA_PER_M2
 from tgslam.types import Frame, RelativePose
 
@@ -67,12 +68,13 @@ def drifting(truth: Walk, error: np.ndarray) -> dict[int, np.ndarray]:
 
 def searched(truth: Walk, T_cw: dict[int, np.ndarray], config: LoopConfig = CONFIG) -> list[Findings]:
     """Of each keyframe in turn."""
-    search = LoopSearch(CAMERA, NOISE, config)
+    search, looks = LoopSearch(config), Looks(CAMERA, NOISE, config)
     known: dict[int, np.ndarray] = {}
     found = []
     for k, frame in enumerate(truth.frames):
         known[k] = T_cw[k]
-        found.append(search.find(k, frame.colour, frame.depth_m, known, believed(known)))
+        looks.add(looks.of(frame.colour, frame.depth_m))
+        found.append(search.find(looks, known, believed(known)))
     return found
 
 
@@ -345,8 +347,10 @@ class TestSearch:
         images += [[truth.frames[1].colour, truth.frames[1].depth_m]]
         T_cw = {k: truth.T_cw[min(k, 2)] for k in range(len(images))}
         T_cw[len(images) - 1] = truth.T_cw[1] @ away
-        search = LoopSearch(CAMERA, NOISE, CONFIG)
-        return [search.find(k, *image, T_cw, believed(T_cw)) for k, image in enumerate(images)][-1]
+        search, looks = LoopSearch(CONFIG), Looks(CAMERA, NOISE, CONFIG)
+        for image in images:
+            looks.add(looks.of(*image))
+        return search.find(looks, T_cw, believed(T_cw))
 
     def test_a_perfect_copy_is_told_apart_by_how_far_it_is(self) -> None:
         assert self.copied(0.3) == Findings((), 0, gated=1)
@@ -354,15 +358,16 @@ class TestSearch:
         assert closure.earlier == 1
 
     def test_images_without_features(self) -> None:
-        search = LoopSearch(CAMERA, NOISE, CONFIG)
+        search, looks = LoopSearch(CONFIG), Looks(CAMERA, NOISE, CONFIG)
         T_cw = dict.fromkeys(range(30), np.eye(4))
-        nothing = np.zeros((240, 320, 3), np.float32), np.zeros((240, 320), np.float32)
-        assert {search.find(k, *nothing, T_cw, believed(T_cw)) for k in range(30)} == {Findings((), 0, 0)}
+        for _ in range(30):
+            looks.add(looks.of(np.zeros((240, 320, 3), np.float32), np.zeros((240, 320), np.float32)))
+            assert search.find(looks, T_cw, believed(T_cw)) == Findings((), 0, 0)
 
     def test_the_graph_closes_the_loop(self) -> None:
         truth = walk("loop", 52, 11)
         graph = PoseGraph(SolvingSettings())
-        search = LoopSearch(CAMERA, NOISE, CONFIG)
+        search, looks = LoopSearch(CONFIG), Looks(CAMERA, NOISE, CONFIG)
         odometry = drifting(truth, self.DRIFT)
         information = np.diag(STEP_SIGMA**-2.0)
         for k, frame in enumerate(truth.frames):
@@ -373,7 +378,8 @@ class TestSearch:
                 graph.add_keyframe(k, {k - 1: motion})
             estimate = graph.optimise()
             T_cw = dict(zip(estimate.keyframes.tolist(), estimate.T_cw, strict=True))
-            for closure in search.find(k, frame.colour, frame.depth_m, T_cw, graph.relative).closures:
+            looks.add(looks.of(frame.colour, frame.depth_m))
+            for closure in search.find(looks, T_cw, graph.relative).closures:
                 graph.add_closure(closure.earlier, k, closure.measured.motion)
         assert graph.closure_count > 10
         before = se3_log(odometry[51] @ inverse(odometry[13]) @ inverse(truth.motion(13, 51)))

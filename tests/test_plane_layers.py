@@ -10,6 +10,7 @@ import pytest
 
 from tests.plane_views import NOISE, Rectangle, Watched, cast, looking, points_c, segment_of
 from tgslam.camera import Camera
+from tgslam.config.graph_settings import LoopConfig
 from tgslam.config.plane_settings import PlanesConfig
 from tgslam.device import runtime
 from tgslam.map.keyframes import Keyframe
@@ -259,7 +260,7 @@ class Observed:
 
     def __init__(self) -> None:
         config = replace(CONFIG, enabled=True)
-        self.map = Map(CAMERA, NOISE, config)
+        self.map = Map(CAMERA, NOISE, LoopConfig(), config)
         self.observer = PlaneObserver(CAMERA, config, NOISE)
 
     def observe(self, T_cw: np.ndarray, depth_m: np.ndarray) -> None:

@@ -21,9 +21,10 @@ from tgslam.geometry import inverse, se3_exp, se3_log
 from tgslam.graph.factors import PlaneError
 from tgslam.graph.gating import passes
 from tgslam.graph.pose_graph import GraphEstimate, PoseGraph
-from tgslam.graph.relative import Measurement, measure
+from tgslam.graph.relative import measure
 from tgslam.graph.structure.candidates import candidates, shared_planes
 from tgslam.planes.estimate import PlaneEstimate
+from tgslam.relative_motion import Measurement
 from tgslam.types import RelativePose
 
 seeds = st.integers(0, 2**32 - 1)

@@ -26,7 +26,7 @@ class Slam:
     def __init__(self, camera: Camera, config: Config) -> None:
         noise, rng = config.loss.noise, np.random.default_rng(config.seed)
         structure = config.structure if config.planes.enabled else None
-        self.camera, self.config, self.map = camera, config, Map(camera, noise, config.planes)
+        self.camera, self.config, self.map = camera, config, Map(camera, noise, config.loops, config.planes)
         self.front_end = FrontEnd(camera, config.tracking, config.loss)
         self._prepare, self._cues = Preparation(camera, noise), Cues(config.keyframes, config.planes)
         self._planes, self._closing = assembly.plane_observer(camera, config), assembly.graph_closing(camera, config)

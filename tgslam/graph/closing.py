@@ -45,7 +45,7 @@ class GraphClosing:
         self._landmarks = config.enabled and config.formulation != "closures"
         by_planes = config.enabled and config.formulation != "landmarks"
         self._search = ClosureSearch(camera, noise, config) if by_planes else None
-        self._loops = LoopSearch(camera, noise, loops) if loops.enabled else None
+        self._loops = LoopSearch(loops) if loops.enabled else None
         self._followed: list[NDArray[np.float64]] = []  # T_cw by the graph's estimate when the map last followed it
         self._sighted: dict[int, set[int]] = {}  # PGI -> keyframes whose sightings are in the graph
         self._untied: list[tuple[int, int]] = []  # keyframes between which closures have moved nothing yet
@@ -135,9 +135,7 @@ class GraphClosing:
         """Of the latest keyframe with earlier ones that look the same."""
         if self._loops is None:
             return ()
-        latest, poses = len(world.keyframes) - 1, dict(enumerate(T_cw))
-        keyframe = world.keyframes[latest]
-        return self._loops.find(latest, keyframe.colour(), keyframe.depth_m(), poses, self._graph.relative).closures
+        return self._loops.find(world.looks, dict(enumerate(T_cw)), self._graph.relative).closures
 
     def _motions(self, T_cw: NDArray[np.float64]) -> dict[int, Matrix4]:
         """Of all keyframes once one of them has moved enough to matter."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.graph.relative import Measurement
+from tgslam.relative_motion import Measurement
 
 # T_ji [4, 4] of keyframes i, j as the graph has it, and its covariance [6, 6]: `PoseGraph.relative`
 Relative = Callable[[int, int], tuple[NDArray[np.float64], NDArray[np.float64]]]

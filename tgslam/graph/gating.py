@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from tgslam.geometry import inverse, se3_log
-from tgslam.graph.relative import Measurement
+from tgslam.relative_motion import Measurement
 
 Vector = NDArray[np.float64]
 

@@ -10,9 +10,11 @@ import numpy as np
 from tgslam.camera import Camera, SensorNoise
 from tgslam.map.gaussians import GaussianMap
 from tgslam.map.keyframes import Keyframes
+from tgslam.recognition.looks import Looks
 from tgslam.types import Matrix4, Plane
 
 if TYPE_CHECKING:
+    from tgslam.config.graph_settings import LoopConfig
     from tgslam.config.plane_settings import PlanesConfig
     from tgslam.planes.instances.instance import PlanarInstance
     from tgslam.planes.instances.registry import PlaneRegistry
@@ -21,10 +23,14 @@ if TYPE_CHECKING:
 class Map:
     """Owns what is known of the world. The first keyframe's camera is the world frame."""
 
-    def __init__(self, camera: Camera, noise: SensorNoise, planes: PlanesConfig | None = None) -> None:
-        """planes: how persistent planes are kept; None, or not enabled = the map knows nothing of planes."""
+    def __init__(
+        self, camera: Camera, noise: SensorNoise, loops: LoopConfig, planes: PlanesConfig | None = None
+    ) -> None:
+        """loops: how places are recognised. planes: how persistent planes are kept; None, or not enabled = the map
+        knows nothing of planes.
+        """
         self.camera, self.noise = camera, noise
-        self.keyframes = Keyframes(camera, noise)
+        self.keyframes, self.looks = Keyframes(camera, noise), Looks(camera, noise, loops)
         self.gaussians = GaussianMap()
         self.planes = _registry(planes, noise, self.keyframes.T_wc) if planes and planes.enabled else None
 

@@ -64,6 +64,10 @@ class FirstOrderTracker:
         with stage(self.stopwatch, "judge"):
             return self._judge.assess(frame, gaussians, T_cw, exposure)
 
+    def accept(self, result: TrackingResult) -> None:
+        """See `Tracker.accept`."""
+        self._judge.accept(result)
+
     def _observations(self, frame: Frame) -> list[losses.Observation]:
         colour, depth_m = runtime.to_device(frame.colour), runtime.to_device(frame.depth_m)
         for _ in range(self.first):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,13 +12,16 @@ from tgslam.config.map_settings import LossConfig
 from tgslam.config.tracking_settings import TrackingConfig
 from tgslam.map.keyframes import Keyframe
 from tgslam.map.world import Map
+from tgslam.recognition.verification import Look
 from tgslam.tracking.brightness import KeyframeExposures
+from tgslam.tracking.doubt import Doubt
+from tgslam.tracking.hypotheses import best, recognised
 from tgslam.tracking.motion import MotionFilter
 from tgslam.tracking.references import Reference, references_of
 from tgslam.tracking.result import TrackingResult
-from tgslam.tracking.solver import make_tracker, track_or_recover
+from tgslam.tracking.solver import coarsest, make_tracker
 from tgslam.tracking.steadying import planes_seen, steadying_planes
-from tgslam.types import Exposure, Frame, Matrix4
+from tgslam.types import Exposure, FloatImage, Frame, Matrix4
 
 _FALLBACKS = 3  # latest keyframes from which a lost camera is sought
 
@@ -28,15 +33,42 @@ class FrontEnd:
         self.tracker = make_tracker(camera, config, loss)
         self._camera, self._config = camera, config
         self._motion = MotionFilter(config.expert.motion)
+        self._doubt = Doubt(camera, coarsest(camera, config))
         self._exposure, self._exposures = Exposure(), KeyframeExposures(camera)
+        self._look: Look | None = None  # of the last frame, where it has been looked at
 
     def track(self, frame: Frame, world: Map, latest_T_cw: Matrix4) -> TrackingResult:
-        """The frame's pose, from where motion leads; if that is lost, from the last frame at T_cw [4, 4] or from the
-        latest keyframes.
+        """The frame's pose, from where motion leads. Where that is in doubt, places count too where it is recognised;
+        if it is lost, also those of the last frame, T_cw [4, 4], and of the latest keyframes.
         """
         predicted, prior = self._motion.predict(frame.timestamp_s), self._motion.information(frame.timestamp_s)
-        fallbacks = [latest_T_cw, *(keyframe.T_cw for keyframe in world.keyframes[: -_FALLBACKS - 1 : -1])]
-        return track_or_recover(self.tracker, frame, world.gaussians, predicted, fallbacks, self._exposure, prior)
+        first = self.tracker.track(frame, world.gaussians, predicted, self._exposure, prior)
+        self._look, median_m = None, _median(frame.depth_m)
+        found = first
+        if self._doubt.about(first, predicted, median_m):
+            found = self._elsewhere(frame, world, first, latest_T_cw)
+        if found.lost:
+            self._doubt.forget()
+            return replace(first, T_cw=predicted, exposure=self._exposure)
+        if found is not first:
+            self.tracker.rasterizer.forward(world.gaussians, found.T_cw)
+        self._doubt.settle(found, predicted, median_m)
+        self.tracker.accept(found)
+        return found
+
+    def _elsewhere(self, frame: Frame, world: Map, first: TrackingResult, latest_T_cw: Matrix4) -> TrackingResult:
+        """The best of all places where the frame may be."""
+        self._look = world.looks.of(frame.colour, frame.depth_m)
+        places = recognised(self._look, world, anywhere=first.lost)
+        found = best(first, [self._from(frame, world, T_cw) for T_cw in places])
+        if found.lost:
+            others = [latest_T_cw, *(keyframe.T_cw for keyframe in world.keyframes[: -_FALLBACKS - 1 : -1])]
+            found = next((other for T_cw in others if not (other := self._from(frame, world, T_cw)).lost), first)
+        return found
+
+    def _from(self, frame: Frame, world: Map, T_cw: Matrix4) -> TrackingResult:
+        """Aligned from a place to start, T_cw [4, 4]."""
+        return self.tracker.track(frame, world.gaussians, T_cw, self._exposure)
 
     def tracked_view(self, world: Map) -> NDArray[np.bool_]:
         """[N] Gaussians in view of the last frame, as of the rendering that it was aligned to."""
@@ -46,6 +78,7 @@ class FrontEnd:
         """Add the tracked frame to the map's keyframes, as bright as the others show the same surfaces."""
         keyframe = Keyframe(frame, result.T_cw, result.exposure, result.information)
         world.keyframes.add(keyframe)
+        world.looks.add(self._look or world.looks.of(frame.colour, frame.depth_m))
         if self._config.exposure == "gain":
             self._exposures.add(world.keyframes)
         return keyframe
@@ -77,11 +110,14 @@ class FrontEnd:
 
     def _references(self, world: Map) -> list[Reference]:
         keyframes = world.keyframes
-        depth_m = keyframes[-1].depth_m()
-        median_m = float(np.median(depth_m[depth_m > 0])) if depth_m.any() else 0.0
-        chosen = references_of(keyframes.T_cw(), median_m, self._config.references)
+        chosen = references_of(keyframes.T_cw(), _median(keyframes[-1].depth_m()), self._config.references)
         return [self._reference(world, number) for number in chosen]
 
     def _reference(self, world: Map, number: int) -> Reference:
         keyframe, planes_c = world.keyframes[number], steadying_planes(world, number)
         return Reference(keyframe.colour(), keyframe.depth_m(), keyframe.T_cw, keyframe.exposure, planes_c)
+
+
+def _median(depth_m: FloatImage) -> float:
+    """Of what is measured of [H, W] m, 0 = none."""
+    return float(np.median(depth_m[depth_m > 0])) if depth_m.any() else 0.0

@@ -18,6 +18,7 @@ from tgslam.ops.rasterize import Rasterizer
 from tgslam.tracking.exposure import fit_exposure
 from tgslam.tracking.linearisation import Lineariser, NormalEquations
 from tgslam.tracking.lost import LostDetector
+from tgslam.tracking.motion import unopposed
 from tgslam.tracking.pyramid import (
     LiveLevel,
     LivePyramid,
@@ -99,6 +100,10 @@ class GaussNewtonTracker:
             T_cw = inverse(T_ml) @ T_cw
         return self._result(T_cw, T_ml, exposure, last)
 
+    def accept(self, result: TrackingResult) -> None:
+        """See `Tracker.accept`."""
+        self.detector.accept(result.measures)
+
     def assess(
         self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure
     ) -> TrackingResult:
@@ -117,6 +122,7 @@ class GaussNewtonTracker:
             "agreement": last.matched / max(last.candidates, 1.0),
             "depth_residual_sigmas": last.depth_residual,
             "colour_residual": last.colour_residual,
+            "colour_residual_sigmas": last.colour_residual / self.config.expert.residuals.sigma_colour,
             "condition": float(np.linalg.cond(information)),
             "gain": exposure.gain,
             "bias": exposure.bias,
@@ -148,7 +154,8 @@ class GaussNewtonTracker:
 
         T_mw: world to where the model was rendered.
         T_pm: from where the model was rendered to the predicted camera, which `prior` [6, 6] draws the pose to, at the
-        finest level. Coarser ones have fewer pixels to hold against it, so it counts as much less there.
+        finest level. Coarser ones have fewer pixels to hold against it, so it counts as much less there. At either, it
+        only speaks where the pixels do not.
         """
         T_ml = np.eye(4)
         matches = [_Match.of(levels, reference, T_mw, exposure) for levels, reference in self._references]
@@ -162,7 +169,7 @@ class GaussNewtonTracker:
                     equations = equations.joined(other, T_rm)
                 # a weak damping holds the directions that nothing observes
                 damping = _DAMPING * np.trace(equations.A) + 1e-9
-                drawn = prior / 4**level
+                drawn = unopposed(prior / 4**level, equations.A)
                 gradient = equations.b + drawn @ se3_log(T_pm @ T_ml)
                 step = np.linalg.solve(equations.A + drawn + damping * np.eye(6), -gradient)
                 T_ml = se3_exp(step) @ T_ml

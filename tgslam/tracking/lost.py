@@ -24,7 +24,7 @@ class LostDetector:
         self._colour_residuals: deque[float] = deque(maxlen=_HISTORY)
 
     def judge(self, measures: dict[str, float]) -> str:
-        """What speaks against a result, "" if nothing does; then its residual joins the history.
+        """What speaks against a result, "" if nothing does.
 
         measures: overlap (share of the live pixels that meet the map), agreement (of those, with like depth),
         inlier_ratio (of those, within three sigma of the surface), colour_residual (intensity), condition (of the
@@ -41,8 +41,11 @@ class LostDetector:
             return f"the colours are off by {measures['colour_residual']:.2f}, more than {usual:.2f}"
         if not measures["condition"] < config.max_condition:
             return f"the pose is not determined (condition number {measures['condition']:.1e})"
-        self._colour_residuals.append(measures["colour_residual"])
         return ""
+
+    def accept(self, measures: dict[str, float]) -> None:
+        """They are those of a frame that was tracked: its residual joins the history."""
+        self._colour_residuals.append(measures["colour_residual"])
 
     def _usual_colour_residual(self) -> float:
         if len(self._colour_residuals) < _MIN_HISTORY:

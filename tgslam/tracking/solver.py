@@ -1,9 +1,8 @@
-"""The two solvers behind one interface, and recovery when the first attempt is lost."""
+"""The two solvers behind one interface."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -17,6 +16,7 @@ from tgslam.map.gaussians import GaussianMap
 from tgslam.ops.rasterize import Rasterizer
 from tgslam.tracking.first_order import FirstOrderTracker
 from tgslam.tracking.gauss_newton import GaussNewtonTracker
+from tgslam.tracking.pyramid import finest_level
 from tgslam.tracking.references import Reference
 from tgslam.tracking.result import TrackingResult
 from tgslam.types import Exposure, Frame
@@ -50,6 +50,10 @@ class Tracker(Protocol):
         """
         ...
 
+    def accept(self, result: TrackingResult) -> None:
+        """It is what a frame has been tracked to: what it measured becomes usual."""
+        ...
+
 
 def make_tracker(camera: Camera, config: TrackingConfig, loss: LossConfig) -> Tracker:
     """The solver that the config names."""
@@ -58,24 +62,7 @@ def make_tracker(camera: Camera, config: TrackingConfig, loss: LossConfig) -> Tr
     return GaussNewtonTracker(camera, config, loss)
 
 
-def track_or_recover(
-    tracker: Tracker,
-    frame: Frame,
-    gaussians: GaussianMap,
-    predicted: NDArray[np.float64],
-    fallbacks: Iterable[NDArray[np.float64]],
-    exposure: Exposure,
-    prior: NDArray[np.float64] | None = None,
-) -> TrackingResult:
-    """Track from the prediction, then from each fallback until one holds; if none does, coast on the prediction.
-
-    prior: of the prediction, see `Tracker.track`; the fallbacks are places to start.
-    """
-    first = tracker.track(frame, gaussians, predicted, exposure, prior)
-    if not first.lost:
-        return first
-    for T_cw in fallbacks:
-        result = tracker.track(frame, gaussians, T_cw, exposure)
-        if not result.lost:
-            return result
-    return replace(first, T_cw=predicted, exposure=exposure)
+def coarsest(camera: Camera, config: TrackingConfig) -> Camera:
+    """Of the images that alignment begins with."""
+    steps = config.alignment_steps if config.solver != "first_order" else config.expert.first_order.adam_steps
+    return camera.halved(finest_level(camera, config.finest_width_px) + len(steps) - 1)

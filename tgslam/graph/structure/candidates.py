@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.config.graph_settings import ClosureConfig
-from tgslam.graph.relative import PlanePairs, information_gain, of_planes
+from tgslam.graph.relative import PlanePairs, of_planes
 from tgslam.planes.estimate import PlaneEstimate, stacked
+from tgslam.relative_motion import information_gain
 
 Vector = NDArray[np.float64]
 Sightings = Mapping[int, PlaneEstimate]  # PGI -> the plane as a keyframe saw it, in its camera's frame

@@ -19,9 +19,10 @@ from tgslam.camera import Camera, SensorNoise
 from tgslam.config.graph_settings import AcceptanceSettings, IcpSettings
 from tgslam.device import runtime
 from tgslam.geometry import adjoint, inverse
-from tgslam.graph.relative import Measurement, PlanePairs, Quadratic, of_planes, solve
+from tgslam.graph.relative import PlanePairs, of_planes
 from tgslam.ops import closure_icp as closure_fit
 from tgslam.planes.estimate import PlaneEstimate, fuse, stacked
+from tgslam.relative_motion import Measurement, Quadratic, solve
 from tgslam.types import FloatImage
 
 Vector = NDArray[np.float64]

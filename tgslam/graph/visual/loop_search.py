@@ -14,16 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tgslam.camera import Camera, SensorNoise
 from tgslam.config.graph_settings import LoopConfig
 from tgslam.geometry import inverse, se3_log
 from tgslam.graph.findings import Closure, Findings, Relative
 from tgslam.graph.gating import passes
-from tgslam.graph.visual.depth_agreement import DepthGrid
-from tgslam.graph.visual.features import Detector
-from tgslam.graph.visual.retrieval import Retrieval
-from tgslam.graph.visual.verification import Look, Sameness, Verification
-from tgslam.types import FloatImage
+from tgslam.recognition.looks import Looks
+from tgslam.recognition.verification import Sameness
 
 Vector = NDArray[np.float64]
 
@@ -32,40 +28,28 @@ Vector = NDArray[np.float64]
 class _Verified:
     """An earlier keyframe whose place the present one shows."""
 
-    order: int  # among the keyframes
     keyframe: int
     same: Sameness
 
 
 class LoopSearch:
-    """Compares each keyframe with the earlier ones that look most alike; it remembers all that it is given."""
+    """Compares each keyframe with the earlier ones that look most alike."""
 
-    def __init__(self, camera: Camera, noise: SensorNoise, config: LoopConfig) -> None:
-        self._camera, self._config = camera, config
-        self._detector, self._retrieval = Detector(config.features, config.expert.matching.corner_contrast), Retrieval()
-        self._verification = Verification(camera, noise, config)
-        self._keyframes: list[int] = []  # in the order they came in
-        self._looks: list[Look] = []
+    def __init__(self, config: LoopConfig) -> None:
+        self._config = config
 
-    def find(
-        self, keyframe: int, colour: FloatImage, depth_m: FloatImage, T_cw: Mapping[int, Vector], relative: Relative
-    ) -> Findings:
-        """At most one closure of the next keyframe, of colour [H, W, 3] in [0, 1] and depth [H, W] m, 0 = none.
+    def find(self, looks: Looks, T_cw: Mapping[int, Vector], relative: Relative) -> Findings:
+        """At most one closure of the latest keyframe, the last one of `looks`.
 
         T_cw: [4, 4] of each keyframe so far, and `relative` between two of them, as the graph has it
         (`PoseGraph.relative`).
         """
-        features = self._detector.detect(colour, depth_m)
-        look = Look(features, DepthGrid.of(depth_m, self._camera))
-        words = self._retrieval.words(features.descriptors)
-        best, unconfirmed = self._recognised(look, self._alike(self._retrieval.scores(words)), T_cw)
-        self._retrieval.add(words)
-        self._keyframes.append(keyframe)
-        self._looks.append(look)
+        latest = len(looks) - 1
+        best, unconfirmed = self._recognised(looks, self._alike(looks.scores(looks[latest])[:latest]), T_cw)
         if best is None:
             return Findings((), unconfirmed, gated=0)
-        measured = self._verification.refined(best.same, self._looks[best.order], look)
-        T_ji, covariance = relative(best.keyframe, keyframe)
+        measured = looks.verification.refined(best.same, looks[best.keyframe], looks[latest])
+        T_ji, covariance = relative(best.keyframe, latest)
         drift = self._config.expert.confirmation.understated**2 * covariance
         if not passes(measured, T_ji, drift, self._config.expert.acceptance.gate_probability):
             return Findings((), unconfirmed, gated=1)
@@ -75,16 +59,18 @@ class LoopSearch:
         """The most alike of the earlier keyframes that are no neighbours, best first; of equal ones the oldest."""
         old = scores[: max(len(scores) - self._config.loop_gap, 0)]
         best = np.argsort(-old, kind="stable")[: self._config.candidates]
-        return [int(order) for order in best if old[order] > 0.0]
+        return [int(keyframe) for keyframe in best if old[keyframe] > 0.0]
 
-    def _recognised(self, look: Look, orders: list[int], T_cw: Mapping[int, Vector]) -> tuple[_Verified | None, int]:
+    def _recognised(
+        self, looks: Looks, keyframes: list[int], T_cw: Mapping[int, Vector]
+    ) -> tuple[_Verified | None, int]:
         """The better of the first two that confirm each other, and how many were verified and not confirmed."""
         verified: list[_Verified] = []
-        for order in orders:
-            same = self._verification.compare(self._looks[order], look)
+        for keyframe in keyframes:
+            same = looks.verification.compare(looks[keyframe], looks[len(looks) - 1])
             if same is None:
                 continue
-            found = _Verified(order, self._keyframes[order], same)
+            found = _Verified(keyframe, same)
             partner = next((other for other in verified if self._confirms(other, found, T_cw)), None)
             if partner is not None:
                 return max(partner, found, key=lambda each: each.same.inliers), len(verified) - 1
@@ -94,7 +80,7 @@ class LoopSearch:
     def _confirms(self, other: _Verified, one: _Verified, T_cw: Mapping[int, Vector]) -> bool:
         """Whether two earlier keyframes, near to each other, see the present one at the same place."""
         limits = self._config.expert.confirmation
-        if abs(other.order - one.order) > limits.partner_gap:
+        if abs(other.keyframe - one.keyframe) > limits.partner_gap:
             return False
         between = T_cw[other.keyframe] @ inverse(T_cw[one.keyframe])
         error = se3_log(other.same.measured.T_ji @ between @ inverse(one.same.measured.T_ji))

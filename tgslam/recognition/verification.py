@@ -19,10 +19,10 @@ from tgslam.camera import Camera, SensorNoise
 from tgslam.config.graph_settings import LoopConfig
 from tgslam.device import runtime
 from tgslam.geometry import adjoint, inverse, transform_points
-from tgslam.graph.relative import Measurement, Quadratic, solve
-from tgslam.graph.visual.depth_agreement import DepthGrid, agreement, compared
-from tgslam.graph.visual.features import Features, matches
 from tgslam.ops import closure_icp as closure_fit
+from tgslam.recognition.depth_agreement import DepthGrid, agreement, compared
+from tgslam.recognition.features import Features, matches
+from tgslam.relative_motion import Measurement, Quadratic, solve
 
 Vector = NDArray[np.float64]
 
