@@ -188,14 +188,6 @@ def test_a_block_is_printed_as_it_stands(tmp_path: Path, capsys: pytest.CaptureF
     assert "2 sh blocks" in capsys.readouterr().err
 
 
-def test_the_readmes_python_runs(tmp_path: Path) -> None:
-    (code,) = blocks(README, "python")
-    printed = run_python(code, tmp_path)
-    assert len(printed.splitlines()) == 20
-    names = {path.name for path in (tmp_path / "room").iterdir()}
-    assert {"trajectory.txt", "keyframes.txt", "map.ply"} <= names
-
-
 def test_the_page_on_python_runs(tmp_path: Path) -> None:
     printed = run_python("\n".join(blocks(CHECKOUT / "docs" / "python.md", "python")), tmp_path)
     assert "frame 11: tracked" in printed
