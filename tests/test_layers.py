@@ -20,9 +20,9 @@ RANKS = (
     {"ops"},
     {"planes", "synthetic"},
     {"map"},
-    {"boundary", "graph", "keyframing", "mapping", "preparation", "tracking"},
+    {"boundary", "graph", "keyframing", "mapping", "preparation", "sensing", "tracking"},
     {"assembly", "datasets", "record", "slam"},
-    {"evaluation", "output", "recording"},
+    {"adaptation", "evaluation", "output", "recording"},
     {"pipeline", "saving"},
     {"bench"},
     {"cli"},
@@ -30,7 +30,7 @@ RANKS = (
 )
 RANKED = {name: rank for rank, names in enumerate(RANKS) for name in names}
 # What must never see ground truth
-SYSTEM = {"assembly", "boundary", "preparation", "record", "slam"}
+SYSTEM = {"adaptation", "assembly", "boundary", "preparation", "record", "sensing", "slam"}
 SYSTEM |= {"graph", "keyframing", "map", "mapping", "planes", "tracking"}
 # Rooms that hold kernels' arguments themselves; all others go through `ops`
 KERNEL_USERS = {"kernels", "ops", "synthetic", "bench"}
