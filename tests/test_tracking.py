@@ -512,7 +512,8 @@ def live_images(level: LiveLevel) -> dict[str, np.ndarray]:
     pixels = pixels.reshape(level.camera.height, -1, alignment.LIVE)[:, : level.camera.width]
     images = dict(zip(("depth", "grey", "gx", "gy"), np.moveaxis(pixels, -1, 0), strict=False))
     strength = pixels[..., alignment.LIVE_STRENGTH]
-    return images | {"gate": 1 - np.clip((strength - level.gate_low) * level.gate_inverse_range, 0, 1)}
+    gate = 1 - np.clip((strength - level.gate_low) * level.gate_inverse_range, 0, 1)
+    return images | {"gate": gate, "saturated": strength < 0}
 
 
 def model_images(level: ModelLevel) -> dict[str, np.ndarray]:
