@@ -150,3 +150,25 @@ def test_depth_in_whole_units_is_taken_as_well(room: SyntheticSource, frames: li
 def test_settings_that_do_not_go_together_are_told_before_the_first_frame(room: SyntheticSource) -> None:
     with pytest.raises(ConfigError, match="planes"):
         Slam(room.camera, load(None, ["closures.enabled=true"]))
+
+
+def test_millimetres_read_in_fifths_of_them_are_told(
+    room: SyntheticSource, frames: list[Frame], caplog: pytest.LogCaptureFixture
+) -> None:
+    stored = np.rint(frames[0].depth_m * 1000.0).astype(np.uint16)
+    Slam(room.camera, Config()).process_frame(replace(frames[0], depth_m=stored, depth_scale=5000.0))
+    assert "dataset.depth_scale=1000 makes a room of it" in caplog.text
+    caplog.clear()
+    Slam(room.camera, Config()).process_frame(replace(frames[0], depth_m=stored, depth_scale=1000.0))
+    assert not caplog.text
+
+
+def test_a_world_that_is_no_room_is_told(
+    room: SyntheticSource, frames: list[Frame], caplog: pytest.LogCaptureFixture
+) -> None:
+    (small,) = scaled(frames[:1], 0.03)
+    Slam(room.camera, Config()).process_frame(small)
+    assert "nothing beyond 0.1" in caplog.text and "unit_m" in caplog.text
+    caplog.clear()
+    Slam(room.camera, load(None, ["unit_m=0.0625"])).process_frame(small)
+    assert not caplog.text

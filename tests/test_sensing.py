@@ -8,7 +8,7 @@ import pytest
 from tgslam.camera import Camera
 from tgslam.config.input_settings import SyntheticConfig
 from tgslam.datasets.built_in import SyntheticSource
-from tgslam.sensing import learn_noise, median_depth_m, unit_of
+from tgslam.sensing import learn_noise, likelier_scale, median_depth_m, reach_m, unit_of
 from tgslam.synthetic.sensor import DEPTH_SIGMA_PER_M2
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
@@ -98,17 +98,41 @@ def test_an_image_with_next_to_no_depth_says_nothing(share: float) -> None:
 @pytest.mark.parametrize("size", [0.003, 0.01, 0.1, 0.4, 0.5, 1.0, 3.0, 5.0, 30.0, 1000.0])
 def test_the_unit_makes_any_world_a_room(size: float) -> None:
     depth_m = corner(size).astype(np.float32)
-    unit, reach_m = unit_of(depth_m), np.quantile(depth_m, 0.95)
+    reach = reach_m(depth_m)
+    assert reach == pytest.approx(np.quantile(depth_m, 0.95), rel=0.02)
+    unit = unit_of(reach)
     assert np.log2(unit) == round(np.log2(unit))
-    assert 1.5 / np.sqrt(2) < reach_m / unit < 8.0 * np.sqrt(2)
+    assert 1.5 / np.sqrt(2) < reach / unit < 8.0 * np.sqrt(2)
     assert (unit == 1.0) == (0.3 < size < 5.0)
 
 
 def test_no_depth_tells_no_unit() -> None:
-    assert unit_of(np.zeros(CAMERA.shape, np.float32)) == 1.0
+    assert unit_of(reach_m(np.zeros(CAMERA.shape, np.float32))) == 1.0
 
 
 def test_a_near_thing_does_not_make_a_room_small() -> None:
     depth_m = corner().astype(np.float32)
     depth_m[:, :256] = 0.2
-    assert unit_of(depth_m) == 1.0
+    assert unit_of(reach_m(depth_m)) == 1.0
+
+
+@pytest.mark.parametrize("noise", [0.6, 1.0, 1.6])
+@pytest.mark.parametrize(("read_by", "right"), [(5000.0, 1000.0), (1000.0, 5000.0)])
+def test_a_room_that_was_read_by_the_other_customary_scale_is_told(read_by: float, right: float, noise: float) -> None:
+    size, per_m2 = right / read_by, noise * DEPTH_SIGMA_PER_M2
+    assert likelier_scale(read_by, per_m2 / size, 3.5 * size) == right
+    assert likelier_scale(right, per_m2, 3.5) is None
+
+
+@pytest.mark.parametrize(
+    ("scale", "noise", "reach"),
+    [
+        (5000.0, 10.0, 3.5),  # a noisy sensor in a room
+        (5000.0, 1.0, 0.7),  # a sensor close to a small thing
+        (5000.0, 0.1, 0.7),  # a good one
+        (50_000.0, 5.0, 0.7),  # nobody takes such a scale by mistake
+        (1000.0, 1.0, 3.5),
+    ],
+)
+def test_what_another_scale_would_not_explain_is_believed(scale: float, noise: float, reach: float) -> None:
+    assert likelier_scale(scale, noise * DEPTH_SIGMA_PER_M2, reach) is None

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 
 import numpy as np
 
 from tgslam.boundary import FrameCheck
 from tgslam.camera import USUAL_NOISE, Camera
 from tgslam.config.schema import Config
-from tgslam.sensing import learn_noise, median_depth_m, unit_of
+from tgslam.sensing import UNUSUAL, learn_noise, likelier_scale, median_depth_m, reach_m, unit_of
 from tgslam.slam import Slam as RoomSlam
 from tgslam.types import Frame, FrameReport, Gaussians, Plane, Trajectory
 
-_UNUSUAL = 2.0  # times the usual noise; up to here, it is one sensor's as well as another's
+_log = logging.getLogger(__name__)
 
 
 class Slam:
@@ -66,10 +67,17 @@ class Slam:
 
     def _adapt(self, first: Frame) -> None:
         """Build the system anew if the first frame, checked, is of another scale or sensor than the usual ones."""
-        config = self.config
-        self._unit_m = unit_of(first.depth_m) if config.unit_m is None else config.unit_m
-        per_m2 = config.loss.depth_sigma_per_m2
-        per_unit = _noise_per_unit(first, self._unit_m) if per_m2 is None else per_m2 * self._unit_m
+        config, reach = self.config, reach_m(first.depth_m)
+        found = _noise_per_m2(first)
+        self._unit_m = unit_of(reach) if config.unit_m is None else config.unit_m
+        if config.loss.depth_sigma_per_m2 is not None:
+            per_unit = config.loss.depth_sigma_per_m2 * self._unit_m
+        else:
+            per_unit = found * self._unit_m
+            if per_unit <= UNUSUAL * USUAL_NOISE.per_m2:  # sensors are much alike, and less noise is no gain
+                per_unit = USUAL_NOISE.per_m2
+        if config.unit_m is None:
+            _warn_of_scale(config.dataset.depth_scale, found, reach, self._unit_m)
         loss = dataclasses.replace(config.loss, depth_sigma_per_m2=per_unit)
         if loss.noise != self._slam.config.loss.noise:
             self._slam = RoomSlam(self.camera, dataclasses.replace(config, loss=loss))
@@ -94,11 +102,27 @@ class Slam:
         return dataclasses.replace(report, T_wc=T_wc)
 
 
-def _noise_per_unit(first: Frame, unit_m: float) -> float:
-    """The sensor's noise at the depths that the first frame shows; the usual one where it is no more, or not told."""
+def _noise_per_m2(first: Frame) -> float:
+    """The sensor's noise at the depths that the first frame shows, 1/m; the usual one where it does not tell."""
     learnt = learn_noise(first.depth_m)
-    found = 0.0 if learnt is None else learnt.equivalent_per_m2(median_depth_m(first.depth_m)) * unit_m
-    return found if found > _UNUSUAL * USUAL_NOISE.per_m2 else USUAL_NOISE.per_m2
+    return USUAL_NOISE.per_m2 if learnt is None else learnt.equivalent_per_m2(median_depth_m(first.depth_m))
+
+
+def _warn_of_scale(depth_scale: float, per_m2: float, reach: float, unit_m: float) -> None:
+    """Say so where depth may have been read by a wrong scale."""
+    other = likelier_scale(depth_scale, per_m2, reach)
+    if other is not None:
+        _log.warning(
+            "depth may be read wrongly: by dataset.depth_scale=%g all is within %.2g m, noise %.2g times the usual; "
+            "dataset.depth_scale=%g makes a room of it, seen by a usual sensor, with lengths %g times as large",
+            depth_scale, reach, per_m2 / USUAL_NOISE.per_m2, other, depth_scale / other,
+        )  # fmt: skip
+    elif unit_m != 1.0:
+        _log.warning(
+            "the first frame shows nothing beyond %.2g m, which is no room: settings in metres count in %g m; if it is "
+            "one, check dataset.depth_scale; unit_m says how large the world is",
+            reach, unit_m,
+        )  # fmt: skip
 
 
 def _scaled_gaussians(gaussians: Gaussians, factor: float) -> Gaussians:

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam.camera import USUAL_NOISE
+
 _WINDOW_PX = 8  # wider than neighbours err alike, narrower than most surfaces
 _MOST_WINDOWS = 1200  # of an image, spread evenly
 _LEAST_WINDOWS = 30  # fewer say nothing
@@ -22,6 +24,8 @@ _TIE = 0.2  # of the logarithm: windows so near to a model speak for it; sqrt(1 
 _LOG_GROWTHS = np.linspace(np.log(1e-6), np.log(1.0), 300)  # of the noise at the median depth, as a part of it
 _FLOORS = np.concatenate([[0.0], np.geomspace(0.1, 10.0, 24)])  # over the part that grows, at the median depth
 _FLOOR_GAIN = 1.05  # a floor must win so many times the windows that one parameter less does
+UNUSUAL = 2.0  # times the usual noise; up to here, it is one sensor's as well as another's
+_CUSTOMARY_SCALES = (1000.0, 5000.0)  # units in a metre: millimetres, and those of the TUM benchmark
 _REACH = 0.95  # of the measurements are nearer than what counts as how far one sees
 _SMALLEST_ROOM_M, _LARGEST_ROOM_M = 1.5, 8.0  # how far one sees in rooms
 
@@ -46,9 +50,18 @@ class LearntNoise:
 
 def median_depth_m(depth_m: NDArray[np.float32]) -> float:
     """Of the measurements of an image [H, W] m, 0 = none; 0.0 when there are none."""
+    return _quantile_m(depth_m, 0.5)
+
+
+def reach_m(depth_m: NDArray[np.float32]) -> float:
+    """How far one sees in an image [H, W] m, 0 = none: what stands close before the camera does not matter."""
+    return _quantile_m(depth_m, _REACH)
+
+
+def _quantile_m(depth_m: NDArray[np.float32], share: float) -> float:
     sample = depth_m[::4, ::4]
     sample = sample[sample > 0] if (sample > 0).any() else depth_m[depth_m > 0]
-    return float(np.median(sample)) if len(sample) else 0.0
+    return float(np.quantile(sample, share)) if len(sample) else 0.0
 
 
 def learn_noise(depth_m: NDArray[np.float32]) -> LearntNoise | None:
@@ -125,16 +138,36 @@ def _votes(logs: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.convolve(counts, kernel, mode="same"))
 
 
-def unit_of(depth_m: NDArray[np.float32]) -> float:
-    """The unit of length, m, in which a world that looks like depth [H, W] m, 0 = none, is as large as a room.
+def unit_of(reach: float) -> float:
+    """The unit of length, m, in which a world where one sees so far, m, is as large as a room.
 
-    A power of two: 1 unless all that is seen is near or far. What stands close before the camera does not make a room
-    small, so this goes by how far one can see.
+    A power of two: 1 unless all that is seen is near, or most of it far.
     """
-    sample = depth_m[::4, ::4]
-    sample = sample[sample > 0] if (sample > 0).any() else depth_m[depth_m > 0]
-    if not len(sample):
+    if reach <= 0.0:
         return 1.0
-    reach_m = float(np.quantile(sample, _REACH))
-    inside = min(max(reach_m, _SMALLEST_ROOM_M), _LARGEST_ROOM_M)
-    return float(2.0 ** np.round(np.log2(reach_m / inside)))
+    inside = min(max(reach, _SMALLEST_ROOM_M), _LARGEST_ROOM_M)
+    return float(2.0 ** np.round(np.log2(reach / inside)))
+
+
+def likelier_scale(depth_scale: float, per_m2: float, reach: float) -> float | None:
+    """Another customary scale of depth images that makes both the sensor and the world usual, where this one does not.
+
+    depth_scale: units in a metre, as depth was read. per_m2: noise of sigma_z = per_m2 z^2, 1/m, and how far one sees,
+    m, as they come out by it. Depth alone never tells its scale; noise and size together do, for those who guess.
+    """
+
+    def usual(factor: float) -> bool:
+        """Whether lengths that are so many times as large would be."""
+        noise = per_m2 / factor / USUAL_NOISE.per_m2
+        return _SMALLEST_ROOM_M < factor * reach < _LARGEST_ROOM_M and 1.0 / UNUSUAL < noise < UNUSUAL
+
+    if depth_scale not in _CUSTOMARY_SCALES or usual(1.0):
+        return None
+    noise = per_m2 / USUAL_NOISE.per_m2
+    for other in _CUSTOMARY_SCALES:
+        factor = depth_scale / other
+        # both must be off, and in the same sense
+        off = noise > UNUSUAL and reach < _SMALLEST_ROOM_M if factor > 1.0 else reach > _LARGEST_ROOM_M
+        if other != depth_scale and off and usual(factor):
+            return other
+    return None
