@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
 from tgslam.errors import FrameError
+from tgslam.evaluation.held_out import Show
 from tgslam.geometry import se3_exp
 from tgslam.types import Frame, FrameReport, FrameStatus, Gaussians, Matrix4, Plane, Rendering, Trajectory
 
@@ -131,6 +132,17 @@ def fake_read_ids(gaussians: Gaussians, T_cw: Matrix4) -> NDArray[np.int32]:
     ids = np.full((CAMERA.height, CAMERA.width), -1, np.int32)
     ids[:, : CAMERA.width // 2] = 4
     return ids
+
+
+def fake_show(T_cw: Matrix4) -> tuple[Rendering, NDArray[np.int32]]:
+    """What `fake_read_ids` and `fake_render` say."""
+    gaussians = FakeSystem().gaussians()
+    return fake_render(gaussians, T_cw), fake_read_ids(gaussians, T_cw)
+
+
+def make_fake_show(gaussians: Gaussians, planes: Sequence[Plane]) -> Show:
+    """`fake_show`, without planes where there are none."""
+    return fake_show if planes else lambda T_cw: (fake_show(T_cw)[0], None)
 
 
 def fake_render(gaussians: Gaussians, T_cw: Matrix4) -> Rendering:

@@ -13,7 +13,7 @@ from tgslam.config.input_settings import SyntheticConfig
 from tgslam.config.loader import load
 from tgslam.config.schema import Config
 from tgslam.datasets.built_in import SyntheticSource
-from tgslam.errors import ConfigError, FrameError
+from tgslam.errors import FrameError
 from tgslam.evaluation.trajectory import ate
 from tgslam.slam import Slam as RoomSlam
 from tgslam.types import Frame, FrameStatus, Trajectory
@@ -145,11 +145,6 @@ def test_depth_in_whole_units_is_taken_as_well(room: SyntheticSource, frames: li
     np.testing.assert_array_equal(play(room, raw).trajectory().T_wc, play(room, metres).trajectory().T_wc)
     with pytest.raises(FrameError, match="depth_scale"):
         Slam(room.camera, Config()).process_frame(replace(raw[0], depth_scale=1.0))
-
-
-def test_settings_that_do_not_go_together_are_told_before_the_first_frame(room: SyntheticSource) -> None:
-    with pytest.raises(ConfigError, match="planes"):
-        Slam(room.camera, load(None, ["closures.enabled=true"]))
 
 
 def test_millimetres_read_in_fifths_of_them_are_told(

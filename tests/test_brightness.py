@@ -15,7 +15,8 @@ from tgslam.config.input_settings import SyntheticConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.geometry import inverse
 from tgslam.map.keyframes import Keyframe, Keyframes
-from tgslam.tracking.brightness import KeyframeExposures, Ratio, Tie, gain_ratio, solve
+from tgslam.tracking.brightness import KeyframeExposures, Ratio, gain_ratio
+from tgslam.tracking.exposure_steps import MAP, Course, Courses, Tie
 from tgslam.types import Exposure
 
 
@@ -77,18 +78,59 @@ def test_a_constant_exposure_stays(source: SyntheticSource) -> None:
     assert_allclose(gains_found(source, range(0, 150, 6), [1.0] * 25), 1.0, atol=0.005)
 
 
+def followed(ties: Sequence[Tie], count: int) -> NDArray[np.float64]:
+    """[count] log gains as keyframes come one by one, the first of which is 0."""
+    course = Course(np.zeros(0), np.zeros(0, bool))
+    nearest = np.array([next((tie.log_gain for tie in ties if tie[:2] == (k, k - 1)), 0.0) for k in range(1, count)])
+    for latest in range(1, count):
+        course = Course(np.append(course.log_gains, 0.0), np.append(course.moves, False))
+        known = [tie for tie in ties if tie.keyframe <= latest]
+        course = Courses(known, np.zeros(1)).best(course, nearest[:latest])
+    return np.append(0.0, course.log_gains)
+
+
+def ties_of(truth: NDArray[np.float64], errors: NDArray[np.float64], sigma: float = 0.03) -> list[Tie]:
+    """With errors [N] of the views that add up from each to the next, as those by vignetting do."""
+    seen, numbers = truth + errors, range(len(truth))
+    pairs = [(k, k - back) for k in numbers for back in (1, 2, 4, 8, 16) if back <= k]
+    return [Tie(k, other, float(seen[k] - seen[other]), sigma) for k, other in pairs]
+
+
 def test_errors_smaller_than_the_systematic_one_do_not_add_up() -> None:
     """As a camera goes on, each view is a little brighter than the one before; far ones tell that none was."""
     ties = [Tie(k, k - 1, -0.008, 0.03) for k in range(1, 100)]
     ties += [Tie(k, k - back, 0.0, 0.05) for back in (8, 16) for k in range(back, 100)]
-    chained = -0.008 * np.arange(100)
-    assert np.abs(solve(ties, chained, 1)).max() < 0.02
+    assert_allclose(followed(ties, 100), 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_constant_exposure_is_told_from_what_views_differ_by(seed: int) -> None:
+    errors = np.random.default_rng(seed).normal(0.0, 0.01, 80)
+    assert_allclose(followed(ties_of(np.zeros(80), errors), 80), 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("step", [0.05, -0.05, 0.2])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_single_step_is_found_among_what_views_differ_by(seed: int, step: float) -> None:
+    truth = np.where(np.arange(80) < 40, 0.0, step)
+    errors = np.random.default_rng(seed).normal(0.0, 0.01, 80)
+    found = followed(ties_of(truth, errors), 80)
+    assert_allclose(found, truth, atol=0.02)
+    assert len(np.unique(found.round(9))) <= 3
+
+
+def test_a_ramp_between_two_holds_is_followed() -> None:
+    truth = np.interp(np.arange(80), [30, 50], [0.0, -0.4])
+    errors = np.random.default_rng(0).normal(0.0, 0.005, 80)
+    found = followed(ties_of(truth, errors), 80)
+    assert_allclose(found, truth, atol=0.02)
+    assert len(np.unique(found.round(9))) < 40  # before and after it holds
 
 
 def test_a_wrong_tie_does_not_count() -> None:
     truth = np.where(np.arange(30) < 15, 0.0, 0.25)
     ties = [Tie(k, k - back, float(truth[k] - truth[k - back]), 0.03) for back in (1, 2, 4) for k in range(back, 30)]
-    assert_allclose(solve([*ties, Tie(29, 3, -1.0, 0.03)], truth, 1), truth[1:], atol=0.01)
+    assert_allclose(followed([*ties, Tie(29, 3, -1.0, 0.03)], 30), truth, atol=0.01)
 
 
 def test_a_keyframe_that_shares_nothing_has_the_gain_of_tracking(source: SyntheticSource) -> None:
@@ -102,6 +144,13 @@ def test_a_keyframe_that_shares_nothing_has_the_gain_of_tracking(source: Synthet
 
 
 def test_gains_before_the_window_stay() -> None:
+    before = np.array([0.0, 0.0, 0.1, 0.0, 0.0, -0.2])
     ties = [Tie(k, k - 1, 0.2, 0.03) for k in range(6, 10)] + [Tie(9, 2, 0.5, 0.03), Tie(8, 2, 0.3, 0.03)]
-    before = np.array([0.0, 0.0, 0.1, 0.0, 0.0, -0.2, 0.0, 0.2, 0.4, 0.6])
-    assert_allclose(solve(ties, before, 6), before[6:], atol=0.01)
+    course = Course(np.array([0.0, 0.2, 0.4, 0.6]), np.ones(4, bool))
+    assert_allclose(Courses(ties, before).best(course, np.full(4, 0.2)).log_gains, [0.0, 0.2, 0.4, 0.6], atol=0.01)
+
+
+def test_the_map_ties_a_keyframe_that_nothing_else_does() -> None:
+    held = Course(np.zeros(1), np.zeros(1, bool))
+    found = Courses([Tie(1, MAP, 0.4, 0.05)], np.array([0.1])).best(held, np.array([0.3]))
+    assert_allclose(found.log_gains, 0.4)

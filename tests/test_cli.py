@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.fakes import FakeSource, FakeSystem, fake_read_ids, fake_render
+from tests.fakes import FakeSource, FakeSystem, fake_render, make_fake_show
 from tgslam.cli import engine, inputs, main
 from tgslam.config.loader import load
 from tgslam.evaluation.run_metrics import METRIC_KEYS
@@ -54,7 +54,9 @@ def world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> World:
     monkeypatch.setattr(engine, "start_device", lambda name, threads=0: "cpu")
     monkeypatch.setattr(engine, "make_system", lambda camera, config: world.system)
     monkeypatch.setattr(engine, "make_render", lambda camera: fake_render)
-    monkeypatch.setattr(engine, "make_read_ids", lambda camera, ids, config: fake_read_ids)
+    monkeypatch.setattr(
+        engine, "make_show", lambda camera, gaussians, planes, config: make_fake_show(gaussians, planes)
+    )
     monkeypatch.chdir(tmp_path)
     return world
 

@@ -13,7 +13,6 @@ from tgslam.camera import Camera, SensorNoise
 from tgslam.config.graph_settings import ClosureConfig, LoopConfig
 from tgslam.config.plane_settings import PlanesConfig
 from tgslam.config.schema import Config
-from tgslam.errors import ConfigError
 from tgslam.geometry import inverse, se3_exp, se3_log
 from tgslam.graph.closing import GraphClosing
 from tgslam.map.keyframes import Keyframe, Keyframes
@@ -175,12 +174,13 @@ def test_planes_that_merge_are_one_landmark_from_then_on() -> None:
     assert other != first
 
 
-def test_closures_without_planes_are_refused_with_the_way_out() -> None:
-    with pytest.raises(ConfigError, match=r"closures\.enabled.*planes\.enabled=true"):
-        Slam(CAMERA, Config(closures=ClosureConfig(enabled=True)))
-    assert Slam(CAMERA, Config(closures=ClosureConfig(enabled=True), planes=PlanesConfig(enabled=True)))._closing
-    assert Slam(CAMERA, Config(loops=LoopConfig(enabled=True)))._closing
-    assert Slam(CAMERA, Config())._closing is None
+def test_without_planes_and_loops_there_is_no_graph() -> None:
+    no_planes, no_loops = PlanesConfig(enabled=False), LoopConfig(enabled=False)
+    assert Slam(CAMERA, Config())._closing
+    assert Slam(CAMERA, Config(planes=no_planes))._closing
+    assert Slam(CAMERA, Config(loops=no_loops))._closing
+    assert Slam(CAMERA, Config(planes=no_planes, loops=no_loops))._closing is None
+    assert Slam(CAMERA, Config(closures=ClosureConfig(enabled=False), loops=no_loops))._closing is None
 
 
 def test_refinement_and_planes_that_disagree_do_not_drive_graph_and_map_apart() -> None:

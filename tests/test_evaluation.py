@@ -279,6 +279,20 @@ def test_scores_of_a_rendering_and_their_mean() -> None:
         images.mean_scores([])
 
 
+def test_scores_are_their_definitions() -> None:
+    x, y, depth_m = 1.2 * picture(3) - 0.1, picture(4), np.where(picture(5)[..., 0] < 0.7, 1.0, 0.0)
+    score = images.score_rendering(Rendering(x, depth_m, depth_m), Frame(0, 0.0, y, depth_m))
+    shown, error = np.clip(x, 0.0, 1.0).astype(np.float64), 0.0
+    for channel in range(3):
+        a, b = shown[..., channel].ravel(), y[..., channel].ravel().astype(np.float64)
+        error += float(np.sum((np.polyval(np.polyfit(a, b, 1), a) - b) ** 2)) / y.size
+    assert score.psnr_db == pytest.approx(-10 * math.log10(np.mean((shown - y) ** 2)))
+    assert score.psnr_masked_db == pytest.approx(-10 * math.log10(np.mean((shown - y)[depth_m > 0] ** 2)))
+    assert score.psnr_affine_db == pytest.approx(-10 * math.log10(error))
+    assert score.ssim == pytest.approx(slow_ssim(shown, y))
+    assert (score.psnr_db, score.ssim) == (images.psnr(x, y), images.ssim(x, y))
+
+
 def test_images_that_cannot_be_compared() -> None:
     good = picture(0)
     broken = good.copy()

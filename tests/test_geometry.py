@@ -168,3 +168,8 @@ def test_quaternions_of_half_turns_and_of_no_matrices() -> None:
     R = np.stack([np.eye(3), *(np.diag(2.0 * axis - 1.0) for axis in np.eye(3))])
     np.testing.assert_allclose(geometry.quat_wxyz_from_matrices(R), np.eye(4), atol=0)
     assert geometry.quat_wxyz_from_matrices(np.zeros((0, 3, 3))).shape == (0, 4)
+
+
+def test_rotated_rows_are_the_rotated_vectors() -> None:
+    R, rows = geometry.se3_exp([0.3, -0.8, 1.1, 0.0, 0.0, 0.0])[:3, :3], np.random.default_rng(0).normal(size=(3, 50))
+    np.testing.assert_allclose(geometry.rotate_rows(R, rows), R @ rows, atol=1e-12)

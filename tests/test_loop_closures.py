@@ -14,7 +14,6 @@ from tests.tiers import changed
 from tgslam.camera import Camera, SensorNoise
 from tgslam.config.graph_settings import LoopConfig, SolvingSettings
 from tgslam.config.input_settings import SyntheticConfig
-from tgslam.config.schema import Config
 from tgslam.datasets.built_in import SyntheticSource, synthetic_camera
 from tgslam.geometry import inverse, se3_exp, se3_log
 from tgslam.graph.findings import Findings
@@ -95,10 +94,6 @@ def features(frame: Frame) -> Features:
 
 def look(frame: Frame) -> Look:
     return Look(features(frame), DepthGrid.of(frame.depth_m, CAMERA))
-
-
-def test_off_by_default() -> None:
-    assert not Config().loops.enabled
 
 
 class TestFeatures:

@@ -5,17 +5,21 @@ from __future__ import annotations
 import json
 import math
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.fakes import FakeSource, FakeSystem, fake_render
+from tests.fakes import FakeSource, FakeSystem, fake_show, make_fake_show
 from tgslam import pipeline
 from tgslam.config.input_settings import EvaluationConfig
+from tgslam.datasets.read_ahead import read_frames
 from tgslam.errors import EvaluationError, FrameError, OutputError, TrackingError
-from tgslam.evaluation.protocol import IMAGE_KEYS, held_out_poses, image_metrics, is_held_out
+from tgslam.evaluation.held_out import view_metrics
+from tgslam.evaluation.protocol import IMAGE_KEYS, held_out_poses, is_held_out
 from tgslam.evaluation.run_metrics import METRIC_KEYS, complete, evaluate_run
+from tgslam.geometry import se3_exp
 from tgslam.output.log import read_log, to_json
 from tgslam.output.ply import read_map
 from tgslam.output.run_folder import RunFolder
@@ -155,7 +159,7 @@ def test_two_runs_write_the_same_bytes(tmp_path: Path) -> None:
 def test_metrics_of_a_run(folder: RunFolder) -> None:
     source = FakeSource(12, bad=(1,))
     pipeline.run(source, FakeSystem(lost=(4,)), folder)
-    metrics = complete(evaluate_run(folder, EvaluationConfig(), source, source.groundtruth(), lambda: fake_render))
+    metrics = complete(evaluate_run(folder, EvaluationConfig(), source, source.groundtruth(), make_fake_show))
     assert tuple(metrics) == METRIC_KEYS
     assert (metrics["frames"], metrics["frames_skipped"], metrics["frames_lost"]) == (12, 1, 1)
     assert metrics["tracked_fraction"] == pytest.approx(10 / 12)
@@ -176,7 +180,7 @@ def test_metrics_of_a_run(folder: RunFolder) -> None:
 def test_metrics_that_do_not_apply_are_null(folder: RunFolder) -> None:
     source = FakeSource(2)
     pipeline.run(source, FakeSystem(), folder)
-    metrics = complete(evaluate_run(folder, EvaluationConfig(), source, source.groundtruth(), lambda: fake_render))
+    metrics = complete(evaluate_run(folder, EvaluationConfig(), source, source.groundtruth(), make_fake_show))
     assert metrics["ate_rmse_cm"] is None
     assert metrics["psnr_db"] is None
     assert metrics["rpe_trans_cm"] == pytest.approx(0, abs=1e-6)
@@ -187,7 +191,7 @@ def test_metrics_that_do_not_apply_are_null(folder: RunFolder) -> None:
 def test_an_input_that_has_shrunk_is_an_error(folder: RunFolder) -> None:
     pipeline.run(FakeSource(12), FakeSystem(), folder)
     with pytest.raises(EvaluationError, match="11 frames now, but this run saw 12"):
-        evaluate_run(folder, EvaluationConfig(), FakeSource(11), None, lambda: fake_render)
+        evaluate_run(folder, EvaluationConfig(), FakeSource(11), None, make_fake_show)
 
 
 def test_a_run_without_results_cannot_be_evaluated(folder: RunFolder) -> None:
@@ -209,18 +213,48 @@ def test_held_out_frames_are_every_nth_by_frame_index() -> None:
         held_out_poses(reports, Trajectory(np.arange(3.0), poses[:3]), interval=5)
 
 
-def test_image_metrics_leave_out_what_cannot_be_read_and_stop_on_request() -> None:
-    gaussians, poses = FakeSystem().gaussians(), [(1, np.eye(4)), (2, np.eye(4))]
-    metrics = image_metrics(FakeSource(4, bad=(1,)), poses, gaussians, fake_render)
+@pytest.mark.parametrize("read_ahead", [False, True])
+def test_image_metrics_leave_out_what_cannot_be_read_and_stop_on_request(read_ahead: bool) -> None:
+    poses = [(1, np.eye(4)), (2, np.eye(4))]
+    metrics = view_metrics(FakeSource(4, bad=(1,)), poses, fake_show, read_ahead=read_ahead)
     assert metrics["heldout_frames"] == 1
-    stopped = image_metrics(FakeSource(4), poses, gaussians, fake_render, stop_requested=lambda: True)
-    assert stopped == dict.fromkeys(IMAGE_KEYS)
+    stopped = view_metrics(FakeSource(4), poses, fake_show, read_ahead=read_ahead, stop_requested=lambda: True)
+    assert {stopped[key] for key in IMAGE_KEYS} == {None}
+
+
+def test_a_held_out_frame_is_read_once_and_rendered_once() -> None:
+    read, rendered = [], []
+
+    class Counted(FakeSource):
+        def read(self, index: int):
+            read.append(index)
+            return super().read(index)
+
+    def show(T_cw):
+        rendered.append(T_cw[0, 3])
+        return fake_show(T_cw)
+
+    poses = [(k, se3_exp([0.0, 0.0, 0.0, -float(k), 0.0, 0.0])) for k in (1, 2, 5)]
+    metrics = view_metrics(Counted(6), poses, show, read_ahead=True)
+    assert read == rendered == [1, 2, 5]
+    assert metrics["heldout_frames"] == 3 and metrics["plane_surface_switches_per_100"] == 0
+
+
+def test_an_image_that_cannot_be_scored_is_an_error() -> None:
+    def broken(T_cw):
+        rendering, ids = fake_show(T_cw)
+        return replace(rendering, colour=np.full_like(rendering.colour, np.nan)), ids
+
+    with pytest.raises(EvaluationError, match="NaN"):
+        view_metrics(FakeSource(4), [(1, np.eye(4)), (2, np.eye(4))], broken)
 
 
 def test_read_frames_passes_other_errors_on() -> None:
     for ahead in (False, True):
-        items = pipeline.read_frames(FakeSource(4, bad=(0,), fails_at=2), ahead)
+        items = read_frames(FakeSource(4, bad=(0,), fails_at=2), ahead)
         assert isinstance(next(items), FrameError)
         next(items)
         with pytest.raises(OSError, match="Input/output"):
             next(items)
+        assert [frame.index for frame in read_frames(FakeSource(9), ahead, [2, 7, 3])] == [2, 7, 3]
+        assert list(read_frames(FakeSource(9), ahead, [])) == []

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.fakes import CAMERA, FakeSource, FakeSystem, fake_read_ids, fake_render
+from tests.fakes import CAMERA, FakeSource, FakeSystem, fake_show, make_fake_show
 from tests.test_plane_outputs import FLOOR, ROOM, turned
 from tgslam import pipeline
 from tgslam.config.input_settings import EvaluationConfig
@@ -18,11 +18,12 @@ from tgslam.datasets.source import FrameRange
 from tgslam.evaluation.plane_metrics import (
     FLOATER_KEY,
     INSTANCE_KEYS,
+    InstanceComparison,
     floater_share,
-    instance_metrics,
     plane_errors,
     summary_metrics,
 )
+from tgslam.evaluation.protocol import IMAGE_KEYS
 from tgslam.evaluation.run_metrics import METRIC_KEYS, complete, evaluate_run
 from tgslam.geometry import inverse, se3_exp
 from tgslam.output.run_folder import RunFolder
@@ -66,9 +67,7 @@ def equations(planes: tuple[Plane, ...]) -> np.ndarray:
 def test_metrics_of_a_run_in_a_known_scene(folder: RunFolder) -> None:
     source = KnownSource(12)
     pipeline.run(source, FakeSystem(), folder)
-    found = evaluate_run(
-        folder, EvaluationConfig(), source, source.groundtruth(), lambda: fake_render, lambda ids: fake_read_ids
-    )
+    found = evaluate_run(folder, EvaluationConfig(), source, source.groundtruth(), make_fake_show)
     metrics = complete(found)
     assert tuple(metrics) == METRIC_KEYS
     assert metrics["plane_pq"] == metrics["plane_frame_pq"] == metrics["plane_miou"] == 1
@@ -79,14 +78,12 @@ def test_metrics_of_a_run_in_a_known_scene(folder: RunFolder) -> None:
     assert metrics["floater_share"] == 0
 
 
-def test_without_a_known_scene_a_reader_or_planes_instance_metrics_are_null(folder: RunFolder) -> None:
+def test_without_a_known_scene_a_map_that_is_shown_or_planes_instance_metrics_are_null(folder: RunFolder) -> None:
     known, unknown, system = KnownSource(12), FakeSource(12), FakeSystem()
     pipeline.run(known, system, folder)
 
-    def instance_values(source: FakeSource | None, read_ids=fake_read_ids) -> set:
-        render = None if source is None else lambda: fake_render
-        reader = None if read_ids is None else lambda ids: read_ids
-        metrics = complete(evaluate_run(folder, EvaluationConfig(), source, None, render, reader))
+    def instance_values(source: FakeSource | None, make_show=make_fake_show) -> set:
+        metrics = complete(evaluate_run(folder, EvaluationConfig(), source, None, make_show))
         assert metrics["planes"] == len(system.planes())
         return {metrics[key] for key in INSTANCE_KEYS}
 
@@ -101,7 +98,7 @@ def test_a_run_of_an_earlier_version_has_no_plane_metrics(folder: RunFolder) -> 
     source = KnownSource(12)
     pipeline.run(source, FakeSystem(), folder)
     folder.planes.unlink()
-    metrics = complete(evaluate_run(folder, EvaluationConfig(), source, None, lambda: fake_render))
+    metrics = complete(evaluate_run(folder, EvaluationConfig(), source, None, make_fake_show))
     assert metrics["planes"] is metrics["plane_area_m2"] is metrics["plane_pq"] is None
     assert metrics[FLOATER_KEY] == 0
 
@@ -122,22 +119,29 @@ def test_labels_follow_the_frames_of_a_range(folder: RunFolder) -> None:
     assert FrameRange(FakeSource(12), 3).truth() is None
 
 
-def test_instance_metrics_add_up_over_frames_and_stop_on_request() -> None:
-    truth, poses = FakeTruth(), [(0, np.eye(4)), (1, np.eye(4)), (2, np.eye(4)), (3, np.eye(4))]
-    seen = iter((4, 4, 6, 4))
-
-    def read_ids(gaussians, T_cw):
-        return np.where(fake_read_ids(gaussians, T_cw) == 4, np.int32(next(seen)), np.int32(-1))
-
-    gaussians, planes = FakeSystem().gaussians(), FakeSystem().planes()
-    metrics = instance_metrics(planes, gaussians, poses, truth, None, read_ids)
+def test_instance_metrics_add_up_over_frames() -> None:
+    comparison, planes = InstanceComparison(FakeTruth()), FakeSystem().planes()
+    assert comparison.metrics(planes, np.eye(4)) == dict.fromkeys(INSTANCE_KEYS)
+    for position, id_ in enumerate((4, 4, 6, 4)):
+        _, ids = fake_show(np.eye(4))
+        comparison.add(position, np.where(ids == 4, np.int32(id_), np.int32(-1)))
+    metrics = comparison.metrics(planes, None)
     assert set(metrics) == set(INSTANCE_KEYS)
     assert metrics["plane_frame_pq"] == 1
     assert metrics["plane_pq"] == pytest.approx(0.75 / 1.5)
     assert metrics["plane_switches_per_100"] == 50
     assert metrics["plane_normal_deg"] is None  # without an alignment
-    stopped = instance_metrics(planes, gaussians, poses, truth, np.eye(4), fake_read_ids, lambda: True)
-    assert stopped == dict.fromkeys(INSTANCE_KEYS)
+
+
+def test_planes_are_not_compared_on_a_request_to_stop(folder: RunFolder) -> None:
+    source, answers = KnownSource(60), iter([False, True, True])
+    pipeline.run(source, FakeSystem(), folder)
+    stopped = complete(
+        evaluate_run(
+            folder, EvaluationConfig(), source, None, make_fake_show, stop_requested=lambda: next(answers, True)
+        )
+    )
+    assert {stopped[key] for key in (*INSTANCE_KEYS, *IMAGE_KEYS, FLOATER_KEY)} == {None}
 
 
 def test_what_a_run_says_of_its_planes() -> None:

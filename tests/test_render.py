@@ -17,7 +17,8 @@ from tgslam.geometry import se3_exp
 from tgslam.kernels.projection import BLUR
 from tgslam.kernels.simd import ALPHA_MIN, T_MIN
 from tgslam.map.gaussians import GaussianMap
-from tgslam.ops.rasterize import MIN_OPACITY, ImageGradient, Rasterizer
+from tgslam.ops.rasterize import ImageGradient, Rasterizer
+from tgslam.ops.render_images import MIN_OPACITY
 from tgslam.ops.splats import MapGradient
 from tgslam.types import Gaussians
 

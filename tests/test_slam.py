@@ -15,7 +15,8 @@ from tgslam.config.schema import Config
 from tgslam.datasets import FrameRange, RgbdSource, open_source
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.errors import FrameError
-from tgslam.evaluation.protocol import held_out_poses, image_metrics
+from tgslam.evaluation.held_out import view_metrics
+from tgslam.evaluation.protocol import held_out_poses
 from tgslam.evaluation.trajectory import ate
 from tgslam.geometry import inverse
 from tgslam.ops.rasterize import Rasterizer
@@ -59,7 +60,8 @@ def ate_cm(trajectory: Trajectory, source: RgbdSource) -> float:
 def held_out_psnr(played: Played, source: RgbdSource) -> float:
     """Over frames that are no keyframes; the reports are of all frames of the source from its first."""
     poses = held_out_poses(played.reports, played.slam.trajectory(), interval=3)
-    scores = image_metrics(source, poses, played.slam.gaussians(), Rasterizer(source.camera).render)
+    rasterizer, gaussians = Rasterizer(source.camera), played.slam.gaussians()
+    scores = view_metrics(source, poses, lambda T_cw: (rasterizer.render(gaussians, T_cw), None))
     assert scores["heldout_frames"] >= 3
     return scores["psnr_db"]
 

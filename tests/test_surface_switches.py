@@ -7,14 +7,17 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from tests.fakes import FakeSource, FakeSystem
+from tests.fakes import FakeSource
 from tests.plane_views import Rectangle, cast, looking
+from tests.reference import patches as reference
 from tgslam.camera import Camera
 from tgslam.errors import FrameError
+from tgslam.evaluation.held_out import view_metrics
 from tgslam.evaluation.panoptic import IdentitySwitches, overlaps, shown
-from tgslam.evaluation.surface_switches import SURFACE_KEY, SurfaceSwitches, patches_of, surface_metrics
+from tgslam.evaluation.patches import patches_of
+from tgslam.evaluation.surface_switches import SURFACE_KEY, SurfaceSwitches
 from tgslam.geometry import inverse
-from tgslam.types import Frame
+from tgslam.types import Frame, Rendering
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 79.5, 59.5)
 WALL = Rectangle((0.0, 2.0, 1.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (4.0, 2.0))
@@ -135,6 +138,23 @@ def test_patches_tell_the_area_that_they_show() -> None:
     assert set(patches.ids.tolist()) == {0}
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_patches_are_their_definition(seed: int) -> None:
+    rng, T_cw = np.random.default_rng(seed), looking((0.4 - 0.3 * seed, -1.0, 1.5), (0.3, 1.4, 0.6))
+    depth_m, labels = cast(SCENE, CAMERA, T_cw)
+    depth_m = (depth_m + SIGMA_PER_M2 * depth_m**2 * rng.standard_normal(depth_m.shape)).astype(np.float32)
+    depth_m[rng.random(depth_m.shape) < 0.1] = 0.0
+    ids = np.where(rng.random(depth_m.shape) < 0.15, -1, labels).astype(np.int32)
+    expected = reference.patches_of(depth_m, ids, CAMERA, inverse(T_cw))
+    found = patches_of(depth_m, ids, CAMERA, inverse(T_cw))
+    *cube, face = (found.keys >> 41, found.keys >> 22 & (1 << 19) - 1, found.keys >> 3 & (1 << 19) - 1, found.keys & 7)
+    places = [tuple(place) for place in np.stack([*(axis - (1 << 18) for axis in cube), face], axis=1).tolist()]
+    assert set(places) == set(expected) and len(places) > 100
+    assert found.ids.tolist() == [expected[place][0] for place in places]
+    assert found.pixels.tolist() == [expected[place][1] for place in places]
+    assert found.areas_m2 == pytest.approx([expected[place][2] for place in places])
+
+
 def test_nothing_measured_is_no_surface() -> None:
     counter = SurfaceSwitches(CAMERA)
     assert counter.per_100_frames is None
@@ -159,15 +179,21 @@ class Torn(FakeSource):
 
 
 def test_metrics_of_a_source_leave_out_what_cannot_be_read_and_stop_on_request() -> None:
-    poses, gaussians = [(i, np.eye(4)) for i in range(6)], FakeSystem().gaussians()
+    poses = [(i, np.eye(4)) for i in range(6)]
+    image = np.zeros((CAMERA.height, CAMERA.width), np.float32)
+    rendering = Rendering(np.zeros((*image.shape, 3), np.float32), image, image)
     seen = iter((4, 4, 6, 6, 4))
 
-    def changing(gaussians, T_cw):
-        return np.full((CAMERA.height, CAMERA.width), next(seen), np.int32)
+    def changing(T_cw):
+        return rendering, np.full(image.shape, next(seen), np.int32)
 
-    def constant(gaussians, T_cw):
-        return np.full((CAMERA.height, CAMERA.width), 4, np.int32)
+    def constant(T_cw):
+        return rendering, np.full(image.shape, 4, np.int32)
 
-    assert surface_metrics(Torn(6), poses, gaussians, changing) == {SURFACE_KEY: pytest.approx(100.0 * 2 / 5)}
-    assert surface_metrics(Torn(6), poses, gaussians, constant) == {SURFACE_KEY: 0}
-    assert surface_metrics(Torn(6), poses, gaussians, constant, lambda: True) == {SURFACE_KEY: None}
+    def without_planes(T_cw):
+        return rendering, None
+
+    assert view_metrics(Torn(6), poses, changing)[SURFACE_KEY] == pytest.approx(100.0 * 2 / 5)
+    assert view_metrics(Torn(6), poses, constant)[SURFACE_KEY] == 0
+    assert view_metrics(Torn(6), poses, without_planes)[SURFACE_KEY] is None
+    assert view_metrics(Torn(6), poses, constant, stop_requested=lambda: True)[SURFACE_KEY] is None

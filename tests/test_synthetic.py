@@ -101,6 +101,21 @@ def test_depth_lies_on_the_labelled_planes(scene):
         assert (towards > -1e-4).all()  # normals point out of the solid, to where the camera is
 
 
+def test_labels_and_areas_are_those_of_the_frame_that_is_asked_for() -> None:
+    def source() -> SyntheticSource:
+        return SyntheticSource(SyntheticConfig(frames=60, width=32, height=24), seed=0)
+
+    used = source()
+    for index in (5, 40, 40, 12):
+        read = used.read((index + 20) % 60 if index == 12 else index)
+        assert (used.labels(index) == source().labels(index)).all()
+        assert (used.seen_areas_m2(index) == source().seen_areas_m2(index)).all()
+        used.labels(index)[:] = -7  # what is given away is the caller's
+        assert (used.labels(index) == source().labels(index)).all()
+        assert (read.depth_m == source().read(read.index).depth_m).all()
+    assert (source().labels(5) != source().labels(40)).any()
+
+
 def test_frames_agree_with_each_other_through_the_exact_poses():
     one = source(width=200, height=150)
     first, second = one.clean(100), one.clean(112)

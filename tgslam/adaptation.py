@@ -25,7 +25,6 @@ class Slam:
     """
 
     def __init__(self, camera: Camera, config: Config) -> None:
-        """Raises ConfigError for settings that do not go together."""
         self.camera, self.config = camera, config
         self._check, self._started = FrameCheck(camera), False
         self._unit_m, self._slam = 1.0, RoomSlam(camera, config)

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 from tgslam.camera import Camera
 from tgslam.config.schema import SystemConfig
-from tgslam.errors import ConfigError
 
 if TYPE_CHECKING:
     from tgslam.graph.closing import GraphClosing
@@ -23,11 +22,9 @@ def plane_observer(camera: Camera, config: SystemConfig) -> PlaneObserver | None
 
 
 def graph_closing(camera: Camera, config: SystemConfig) -> GraphClosing | None:
-    """The pose graph with its closures, None = there is none. Raises ConfigError for closures without planes."""
-    if not (config.closures.enabled or config.loops.enabled):
+    """The pose graph with its closures, None = nothing would ever close."""
+    if not (config.loops.enabled or (config.closures.enabled and config.planes.enabled)):
         return None
-    if config.closures.enabled and not config.planes.enabled:
-        raise ConfigError("closures.enabled needs planes: set planes.enabled=true as well")
     from tgslam.graph.closing import GraphClosing
 
     return GraphClosing(camera, config.loss.noise, config.closures, config.loops)

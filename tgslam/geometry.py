@@ -138,6 +138,15 @@ def transform_points(T_ab: ArrayLike, points_b: ArrayLike) -> Array:
     return np.asarray(points_b, np.float64) @ T[:3, :3].T + T[:3, 3]
 
 
+def rotate_rows(R_ab: Array, rows_b: Array) -> Array:
+    """Many vectors, as their rows x, y, z [3, N], turned from frame b to frame a.
+
+    Not by BLAS: for a matrix this small, its threads take more time than they save.
+    """
+    x, y, z = rows_b
+    return np.stack([x * a + y * b + z * c for a, b, c in R_ab])
+
+
 def tangent_axes(normal: Array) -> Array:
     """Unit tangents [..., 2, 3] of unit normals [..., 3], right-handed with them: what planes' covariances speak of."""
     helper = np.eye(3)[np.argmin(np.abs(normal), axis=-1)]

@@ -6,11 +6,11 @@ import contextlib
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+from tgslam.datasets.read_ahead import read_frames
 from tgslam.datasets.source import RgbdSource
 from tgslam.errors import FrameError, TrackingError
 from tgslam.output.log import FrameLog
@@ -76,28 +76,6 @@ def run(
         _save_partial(system, folder)
         raise
     return summary
-
-
-def read_frames(source: RgbdSource, ahead: bool) -> Iterator[Frame | FrameError]:
-    """Every frame in order, or why it cannot be used; with `ahead`, one thread reads the next one meanwhile."""
-    if not ahead:
-        for position in range(len(source)):
-            yield _read(source, position)
-        return
-    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="read-ahead") as pool:
-        upcoming = pool.submit(_read, source, 0)
-        for position in range(1, len(source) + 1):
-            current = upcoming.result()
-            if position < len(source):
-                upcoming = pool.submit(_read, source, position)
-            yield current
-
-
-def _read(source: RgbdSource, position: int) -> Frame | FrameError:
-    try:
-        return source.read(position)
-    except FrameError as error:
-        return error
 
 
 def _frame_loop(

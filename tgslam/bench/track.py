@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from tgslam import pipeline
 from tgslam.bench.timing import Samples, summary_ms
 from tgslam.config.schema import Config
+from tgslam.datasets.read_ahead import read_frames
 from tgslam.datasets.source import RgbdSource
 from tgslam.device.stopwatch import Stopwatch
 from tgslam.errors import FrameError, TrackingError
@@ -28,7 +28,7 @@ def measure(source: RgbdSource, config: Config, observer: FrameObserver = lambda
     system = Slam(source.camera, config)
     stopwatch = system.front_end.tracker.stopwatch = Stopwatch()
     samples, map_s, tracked = Samples(stopwatch), [], 0
-    for frame in pipeline.read_frames(source, ahead=False):
+    for frame in read_frames(source, ahead=False):
         stopwatch.seconds.clear()
         report = _process(system, frame)
         if report is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from tgslam.camera import Camera
 from tgslam.config.schema import Config
 from tgslam.device.quick_import import quick_import
-from tgslam.evaluation.plane_metrics import ReadIds
-from tgslam.evaluation.protocol import Render
+from tgslam.evaluation.held_out import Show
 from tgslam.pipeline import System
-from tgslam.types import Gaussians, Matrix4, Plane
+from tgslam.types import Gaussians, Matrix4, Plane, Rendering
+
+Render = Callable[[Gaussians, Matrix4], Rendering]  # the map seen from T_cw
 
 
 def add_device_option(parser: argparse.ArgumentParser) -> None:
@@ -47,17 +48,17 @@ def make_render(camera: Camera) -> Render:
     return Rasterizer(camera).render
 
 
-def make_read_ids(camera: Camera, planes: Sequence[Plane], config: Config) -> ReadIds:
-    """The function that reads for `camera` which of the planes a map shows, off its rendered embedding."""
+def make_show(camera: Camera, gaussians: Gaussians, planes: Sequence[Plane], config: Config) -> Show:
+    """The function that renders the map for `camera` and reads which of the planes it shows, off the same rendering."""
     from tgslam.ops.rasterize import Rasterizer
     from tgslam.ops.splats import FixedSplats
     from tgslam.planes.identity.reading import PlaneReader
 
-    rasterizer = Rasterizer(camera)
-    reader = PlaneReader(camera, planes, config.structure, config.loss.noise)
+    rasterizer, splats = Rasterizer(camera), FixedSplats.of(gaussians)
+    reader = PlaneReader(camera, planes, config.structure, config.loss.noise) if planes else None
 
-    def read(gaussians: Gaussians, T_cw: Matrix4) -> NDArray[np.int32]:
-        images = rasterizer.forward(FixedSplats.of(gaussians), T_cw, with_embedding=True)
-        return reader.read(images, T_cw)
+    def show(T_cw: Matrix4) -> tuple[Rendering, NDArray[np.int32] | None]:
+        images = rasterizer.forward(splats, T_cw, with_embedding=reader is not None)
+        return images.rendering(), None if reader is None else reader.read(images, T_cw)
 
-    return read
+    return show

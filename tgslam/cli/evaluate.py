@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tgslam.cli import engine
-from tgslam.cli.inputs import open_frames
+from tgslam.cli.inputs import can_read_ahead, open_frames
 from tgslam.cli.summary import print_metrics
 from tgslam.config.schema import Config
 from tgslam.datasets.groundtruth import read_groundtruth
@@ -48,8 +48,8 @@ def execute(args: argparse.Namespace) -> int:
         config.evaluation,
         source,
         groundtruth,
-        make_render=lambda: engine.make_render(record.camera),
-        make_read_ids=lambda planes: engine.make_read_ids(record.camera, planes, config),
+        lambda gaussians, planes: engine.make_show(record.camera, gaussians, planes, config),
+        read_ahead=can_read_ahead(config),
     )
     if args.groundtruth is not None and found["ate_rmse_all_cm"] is None:
         raise EvaluationError(f"{args.groundtruth}: cannot be compared with {folder.trajectory}; see the warning above")

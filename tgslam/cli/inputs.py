@@ -36,3 +36,8 @@ def open_frames(config: Config, input_dir: Path | None, frames: Frames) -> RgbdS
     """The source of a run, narrowed to --frames. Raises DatasetError and ConfigError."""
     source = open_source(config.dataset, config.synthetic, config.seed, input_dir)
     return source if frames == (None, None, None) else FrameRange(source, *frames)
+
+
+def can_read_ahead(config: Config) -> bool:
+    """Whether another thread may read the frames: not those of built-in scenes, which kernels of this thread draw."""
+    return config.dataset.format != "synthetic"

@@ -12,8 +12,7 @@ import numpy as np
 from tgslam.cli import engine
 from tgslam.cli.inputs import open_frames
 from tgslam.errors import OutputError
-from tgslam.evaluation.plane_metrics import ReadIds
-from tgslam.evaluation.protocol import Render
+from tgslam.evaluation.held_out import Show
 from tgslam.geometry import inverse, se3_exp, transform_points
 from tgslam.output.log import read_log
 from tgslam.output.overview import Overview, draw_overview
@@ -66,65 +65,53 @@ def execute(args: argparse.Namespace) -> int:
     if output.exists() and (not output.is_dir() or any(output.iterdir())) and not args.overwrite:
         raise OutputError(f"{output}: is there already; choose another --output, or add --overwrite")
     engine.start_device(args.device)
-    render = engine.make_render(camera)
+    show = engine.make_show(camera, gaussians, planes, folder.read_config())
     if args.overview:
-        poses = _write_overview(output, folder, gaussians, planes, poses, render)
+        poses = _write_overview(output, folder, planes, poses, show)
     elif args.planes:
-        read_ids = engine.make_read_ids(camera, planes, folder.read_config())
-        _write_plane_images(output, gaussians, poses, render, read_ids, planes)
+        _write_plane_images(output, poses, show, planes)
     else:
-        _write_map_images(output, gaussians, poses, render)
+        _write_map_images(output, gaussians, poses, show)
     write_trajectory(output / "poses.txt", poses)
     _log.info("%d image%s of each kind %s in %s", len(poses), *(("s", "are") if len(poses) > 1 else ("", "is")), output)
     return 0
 
 
-def _write_map_images(output: Path, gaussians: Gaussians, poses: Trajectory, render: Render) -> None:
+def _write_map_images(output: Path, gaussians: Gaussians, poses: Trajectory, show: Show) -> None:
     for kind in ("colour", "depth", "depth_colours"):
         (output / kind).mkdir(parents=True, exist_ok=True)
     far_m = _far_m(gaussians, poses.T_wc[0])
     for number, T_wc in enumerate(poses.T_wc):
-        image = render(gaussians, inverse(T_wc))
+        image, _ = show(inverse(T_wc))
         file_name = f"{number:06d}.png"
         write_colour(output / "colour" / file_name, image.colour)
         write_depth(output / "depth" / file_name, image.depth_m)
         write_depth_colours(output / "depth_colours" / file_name, image.depth_m, far_m)
 
 
-def _write_plane_images(
-    output: Path,
-    gaussians: Gaussians,
-    poses: Trajectory,
-    render: Render,
-    read_ids: ReadIds,
-    planes: tuple[Plane, ...],
-) -> None:
+def _write_plane_images(output: Path, poses: Trajectory, show: Show, planes: tuple[Plane, ...]) -> None:
     (output / "planes").mkdir(parents=True, exist_ok=True)
     for number, T_wc in enumerate(poses.T_wc):
-        T_cw = inverse(T_wc)
-        image = plane_overlay(render(gaussians, T_cw).colour, read_ids(gaussians, T_cw), planes)
-        write_colour(output / "planes" / f"{number:06d}.png", image)
+        image, ids = show(inverse(T_wc))
+        assert ids is not None  # of a map with planes
+        write_colour(output / "planes" / f"{number:06d}.png", plane_overlay(image.colour, ids, planes))
 
 
 def _write_overview(
-    output: Path,
-    folder: RunFolder,
-    gaussians: Gaussians,
-    planes: tuple[Plane, ...],
-    keyframes: Trajectory,
-    render: Render,
+    output: Path, folder: RunFolder, planes: tuple[Plane, ...], keyframes: Trajectory, show: Show
 ) -> Trajectory:
     """Write overview.png at the keyframe that shows most planes, the first of equals, and return its pose."""
-    record, config = folder.read_record(), folder.read_config()
+    record = folder.read_record()
     number = max(range(len(keyframes)), key=lambda k: sum(k in plane.keyframes for plane in planes))
     frame = _keyframe_image(folder, number)
     T_wc = keyframes.T_wc[number]
-    read_ids = engine.make_read_ids(record.camera, planes, config)
+    rendering, ids = show(inverse(T_wc))
+    assert ids is not None  # of a map with planes
     view = Overview(
         title=f"input: keyframe {number} (frame {frame.index})",
         colour=frame.colour,
-        rendering=render(gaussians, inverse(T_wc)).colour,
-        ids=read_ids(gaussians, inverse(T_wc)),
+        rendering=rendering.colour,
+        ids=ids,
         planes=planes,
         T_wc=T_wc,
         centres_w=read_trajectory(folder.trajectory).T_wc[:, :3, 3],

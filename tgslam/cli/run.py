@@ -12,7 +12,7 @@ from typing import Any
 
 from tgslam import __version__, pipeline
 from tgslam.cli import engine
-from tgslam.cli.inputs import open_frames, parse_frames, resolve_config
+from tgslam.cli.inputs import can_read_ahead, open_frames, parse_frames, resolve_config
 from tgslam.cli.interrupt import StopRequest
 from tgslam.cli.options import natural
 from tgslam.cli.summary import print_metrics
@@ -99,7 +99,7 @@ def _run_and_evaluate(
             source,
             system,
             folder,
-            read_ahead=config.dataset.format != "synthetic",  # built-in scenes are drawn by kernels of this thread
+            read_ahead=can_read_ahead(config),
             refine=not args.no_final,
             observer=observer,
             stop_requested=stop,
@@ -110,8 +110,8 @@ def _run_and_evaluate(
         config.evaluation,
         source,
         _groundtruth(source),
-        make_render=None if stop() else lambda: engine.make_render(source.camera),
-        make_read_ids=lambda planes: engine.make_read_ids(source.camera, planes, config),
+        None if stop() else lambda gaussians, planes: engine.make_show(source.camera, gaussians, planes, config),
+        read_ahead=can_read_ahead(config),
         stop_requested=stop,
     )
     metrics["stage_s"] |= {

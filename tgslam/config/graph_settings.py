@@ -122,7 +122,9 @@ class ClosureExpert:
 class ClosureConfig:
     """The pose graph over keyframes, and what planes seen again say to it (section 3.4)."""
 
-    enabled: bool = setting(False, doc="Planes correct the keyframes' poses. Off: they stay where tracking put them.")
+    enabled: bool = setting(
+        True, doc="Planes correct the keyframes' poses. Off, or without planes: they stay where tracking put them."
+    )
     formulation: str = setting(
         "landmarks",
         choices=("closures", "landmarks", "both"),
@@ -222,7 +224,7 @@ class LoopConfig:
     """Visual loop closures: keyframes that look the same, whatever the graph says of where they are."""
 
     enabled: bool = setting(
-        False, doc="Places that look the same close loops. Not part of the method: off, planes are seen at work alone."
+        True, doc="Places that look the same close loops. Not part of the method: off, planes are seen at work alone."
     )
     features: int = setting(400, 50, 10_000, doc="Features that are kept of a keyframe, at most.")
     candidates: int = setting(4, 2, 100, doc="Earlier keyframes that a keyframe is compared with: the most alike.")

@@ -225,7 +225,7 @@ class PlanesExpert:
 class PlanesConfig:
     """Planes of single views (section 3.2), and the persistent ones (PGIs, section 3.3) that they are matched to."""
 
-    enabled: bool = setting(False, doc="Whether planes are looked for; false: the map knows nothing of them.")
+    enabled: bool = setting(True, doc="Whether planes are looked for; false: the map knows nothing of them.")
     max_segments: int = setting(32, 1, 1000, doc="K: segments of a view that are kept, the largest ones.")
     min_area_share: float = setting(0.003, 0.0, 1.0, doc="Least area of a segment, as a share of the image.")
     confirm_views: int = setting(

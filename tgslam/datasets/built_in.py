@@ -35,6 +35,7 @@ class SyntheticSource:
         self._config, self._seed = config, seed
         self._scene, self._path = spec.build(config.frames / FRAME_RATE_HZ)
         self._raycaster = Raycaster(self._scene, self.camera)
+        self._latest: tuple[int, View] | None = None  # a frame, and its geometry at the middle of the exposure
 
     def __len__(self) -> int:
         return self._config.frames
@@ -56,7 +57,7 @@ class SyntheticSource:
 
     def labels(self, index: int) -> NDArray[np.int32]:
         """Plane label of each pixel [H, W], an index into `planes`; -1 where the surface is no plane."""
-        return self._raycaster.view(self.pose(index)).label
+        return self._view(index).label.copy()
 
     def planes(self) -> NDArray[np.float64]:
         """World planes [P, 4]: unit normal out of the solid and offset in m, n . x + d = 0."""
@@ -64,7 +65,7 @@ class SyntheticSource:
 
     def seen_areas_m2(self, index: int) -> NDArray[np.float64]:
         """[P] of the parts of the faces on `planes` that the frame shows."""
-        view = self._raycaster.view(self.pose(index))
+        view = self._view(index)
         on = view.label >= 0
         v, u = np.nonzero(on)
         camera = self.camera
@@ -96,10 +97,17 @@ class SyntheticSource:
             raise IndexError(f"{self.name}: frame {index} of {len(self)}")
         return index / FRAME_RATE_HZ
 
+    def _view(self, index: int) -> View:
+        """The exact geometry of a frame: asked for its labels and its areas, as of one just read, it is cast once."""
+        if self._latest is None or self._latest[0] != index:
+            self._latest = index, self._raycaster.view(self.pose(index))
+        return self._latest[1]
+
     def _exposed(self, index: int) -> tuple[FloatImage, View]:
         """Colour with blur and gain, and the exact geometry at the exposure's middle."""
         time_s, images = self._time_s(index), self._config.motion_blur
         colour, view = self._raycaster.render(self._path(time_s))
+        self._latest = index, view
         if images > 1:
             offsets_s = ((np.arange(images) + 0.5) / images - 0.5) * EXPOSURE_S
             renders = (self._raycaster.render(self._path(time_s + float(offset)))[0] for offset in offsets_s)

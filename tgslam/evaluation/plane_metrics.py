@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.datasets.truth import SceneTruth
-from tgslam.evaluation.panoptic import IdentitySwitches, overlaps, panoptic, shown
-from tgslam.geometry import inverse, transform_points
+from tgslam.evaluation.panoptic import IdentitySwitches, IdImage, overlaps, panoptic, shown
+from tgslam.geometry import transform_points
 from tgslam.types import Gaussians, Matrix4, Plane
 
 Metrics = dict[str, float | None]
-ReadIds = Callable[[Gaussians, Matrix4], NDArray[np.int32]]  # plane [H, W] that the map shows seen from T_cw, -1 = none
 
 SUMMARY_KEYS = ("planes", "plane_area_m2", "plane_rms_mm")
 INSTANCE_KEYS = (
@@ -40,53 +39,55 @@ def summary_metrics(planes: Sequence[Plane]) -> Metrics:
     }
 
 
-def instance_metrics(
-    planes: Sequence[Plane],
-    gaussians: Gaussians,
-    poses: Sequence[tuple[int, Matrix4]],
-    truth: SceneTruth,
-    T_alignment: Matrix4 | None,
-    read_ids: ReadIds,
-    stop_requested: Callable[[], bool] = lambda: False,
-) -> Metrics:
-    """The values of `INSTANCE_KEYS` at `poses` (position, T_wc): the ids that the map shows against the frames' labels.
+class InstanceComparison:
+    """Compares the ids that the map shows in the held-out frames with the true labels.
 
     A plane counts when a frame shows `MIN_AREA_M2` of it, in all the frames that show enough of it to speak of. An
     estimated plane that is smaller may match, but is not held against the map when it does not.
-    T_alignment: estimated world to true world, as the poses align; without it the errors of the planes are null.
-    All are null on a request to stop.
     """
-    frames, areas_m2 = [], np.zeros(len(truth.planes()))
-    for position, T_wc in poses:
-        if stop_requested():
+
+    def __init__(self, truth: SceneTruth) -> None:
+        self._truth = truth
+        self._frames: list[Counter[tuple[int, int]]] = []
+        self._areas_m2 = np.zeros(len(truth.planes()))  # the most that a frame shows of each true plane
+
+    def add(self, position: int, ids: IdImage) -> None:
+        """Take the ids [H, W] that the map shows at the pose of the frame at that position of the source."""
+        self._frames.append(overlaps(self._truth.labels(position), ids))
+        self._areas_m2 = np.maximum(self._areas_m2, self._truth.seen_areas_m2(position))
+
+    def metrics(self, planes: Sequence[Plane], T_alignment: Matrix4 | None) -> Metrics:
+        """The values of `INSTANCE_KEYS` for the map's planes; null without a frame.
+
+        T_alignment: estimated world to true world, as the poses align; without it the planes' errors are null.
+        """
+        if not self._frames:
             return dict.fromkeys(INSTANCE_KEYS)
-        frames.append(overlaps(truth.labels(position), read_ids(gaussians, inverse(T_wc))))
-        areas_m2 = np.maximum(areas_m2, truth.seen_areas_m2(position))
-    large = frozenset(np.flatnonzero(areas_m2 >= MIN_AREA_M2).tolist())
-    minor = frozenset(plane.id for plane in planes if plane.area_m2 < MIN_AREA_M2)
-    switches, pixels, qualities = IdentitySwitches(), Counter[tuple[int, int]](), []
-    all_labels, all_ids = set[int](), set[int]()
-    for found in frames:
-        labels, ids = shown(found)
-        labels &= large
-        switches.add(found, labels)
-        qualities.append(panoptic(found, labels, ids, minor).quality)
-        pixels += found
-        all_labels |= labels
-        all_ids |= ids
-    score = panoptic(pixels, all_labels, all_ids, minor)
-    defined = [quality for quality in qualities if quality is not None]
-    errors = {} if T_alignment is None else plane_errors(planes, score.matches, truth.planes(), T_alignment)
-    return {
-        **dict.fromkeys(INSTANCE_KEYS),
-        "plane_pq": score.quality,
-        "plane_frame_pq": float(np.mean(defined)) if defined else None,
-        "plane_miou": score.mean_iou,
-        "plane_precision": score.precision,
-        "plane_recall": score.recall,
-        "plane_switches_per_100": switches.per_100_frames,
-        **errors,
-    }
+        large = frozenset(np.flatnonzero(self._areas_m2 >= MIN_AREA_M2).tolist())
+        minor = frozenset(plane.id for plane in planes if plane.area_m2 < MIN_AREA_M2)
+        switches, pixels, qualities = IdentitySwitches(), Counter[tuple[int, int]](), []
+        all_labels, all_ids = set[int](), set[int]()
+        for found in self._frames:
+            labels, ids = shown(found)
+            labels &= large
+            switches.add(found, labels)
+            qualities.append(panoptic(found, labels, ids, minor).quality)
+            pixels += found
+            all_labels |= labels
+            all_ids |= ids
+        score = panoptic(pixels, all_labels, all_ids, minor)
+        defined = [quality for quality in qualities if quality is not None]
+        true_planes = self._truth.planes()
+        return {
+            **dict.fromkeys(INSTANCE_KEYS),
+            "plane_pq": score.quality,
+            "plane_frame_pq": float(np.mean(defined)) if defined else None,
+            "plane_miou": score.mean_iou,
+            "plane_precision": score.precision,
+            "plane_recall": score.recall,
+            "plane_switches_per_100": switches.per_100_frames,
+            **({} if T_alignment is None else plane_errors(planes, score.matches, true_planes, T_alignment)),
+        }
 
 
 def plane_errors(

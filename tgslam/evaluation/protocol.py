@@ -11,17 +11,14 @@ import logging
 from collections.abc import Callable, Sequence
 
 from tgslam.config.input_settings import EvaluationConfig
-from tgslam.datasets.source import RgbdSource
-from tgslam.errors import EvaluationError, FrameError
-from tgslam.evaluation.image_metrics import ImageScores, mean_scores, score_rendering
+from tgslam.errors import EvaluationError
+from tgslam.evaluation.image_metrics import ImageScores, mean_scores
 from tgslam.evaluation.trajectory import ate, rpe
-from tgslam.geometry import inverse
-from tgslam.types import FrameReport, FrameStatus, Gaussians, Matrix4, Rendering, Trajectory
+from tgslam.types import FrameReport, FrameStatus, Matrix4, Trajectory
 
 _log = logging.getLogger(__name__)
 
 Metrics = dict[str, float | None]
-Render = Callable[[Gaussians, Matrix4], Rendering]  # the map seen from T_cw
 
 TRAJECTORY_KEYS = ("ate_rmse_cm", "ate_rmse_all_cm", "rpe_trans_cm", "rpe_rot_deg")
 IMAGE_KEYS = ("psnr_db", "psnr_affine_db", "ssim", "lpips", "psnr_masked_db", "depth_l1_cm", "heldout_frames")
@@ -79,27 +76,8 @@ def held_out_poses(reports: Sequence[FrameReport], every_frame: Trajectory, inte
     ]
 
 
-def image_metrics(
-    source: RgbdSource,
-    poses: Sequence[tuple[int, Matrix4]],
-    gaussians: Gaussians,
-    render: Render,
-    stop_requested: Callable[[], bool] = lambda: False,
-) -> Metrics:
-    """The values of `IMAGE_KEYS` over the frames of `held_out_poses`; null when there is none or on a request to stop.
-
-    A frame that cannot be read is left out.
-    """
-    scores: list[ImageScores] = []
-    for position, T_wc in poses:
-        if stop_requested():
-            return dict.fromkeys(IMAGE_KEYS)
-        try:
-            frame = source.read(position)
-        except FrameError as error:
-            _log.warning("a held-out frame is left out: %s", error)
-            continue
-        scores.append(score_rendering(render(gaussians, inverse(T_wc)), frame))
+def mean_image_metrics(scores: list[ImageScores]) -> Metrics:
+    """The values of `IMAGE_KEYS` over the held-out frames that could be read; null when there is none."""
     if not scores:
         _log.warning("no frame was held out: the image metrics are null")
         return dict.fromkeys(IMAGE_KEYS)

@@ -10,25 +10,19 @@ from typing import Any
 
 from tgslam.config.input_settings import EvaluationConfig
 from tgslam.datasets.source import RgbdSource
+from tgslam.datasets.truth import SceneTruth
 from tgslam.errors import EvaluationError, OutputError
+from tgslam.evaluation.held_out import Show, view_metrics
 from tgslam.evaluation.plane_metrics import (
     FLOATER_KEY,
     INSTANCE_KEYS,
     SUMMARY_KEYS,
-    ReadIds,
+    InstanceComparison,
     floater_share,
-    instance_metrics,
     summary_metrics,
 )
-from tgslam.evaluation.protocol import (
-    IMAGE_KEYS,
-    TRAJECTORY_KEYS,
-    Render,
-    held_out_poses,
-    image_metrics,
-    trajectory_metrics,
-)
-from tgslam.evaluation.surface_switches import SURFACE_KEY, surface_metrics
+from tgslam.evaluation.protocol import IMAGE_KEYS, TRAJECTORY_KEYS, Metrics, held_out_poses, trajectory_metrics
+from tgslam.evaluation.surface_switches import SURFACE_KEY
 from tgslam.evaluation.trajectory import align_poses
 from tgslam.output.log import read_log
 from tgslam.output.planes_io import read_planes
@@ -79,15 +73,16 @@ def evaluate_run(
     config: EvaluationConfig,
     source: RgbdSource | None,
     groundtruth: Trajectory | None,
-    make_render: Callable[[], Render] | None,
-    make_read_ids: Callable[[Sequence[Plane]], ReadIds] | None = None,
+    make_show: Callable[[Gaussians, Sequence[Plane]], Show] | None,
+    *,
+    read_ahead: bool = False,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
     """Every metric that the files of a run and its input give: the one way for both `run` and `eval`.
 
-    make_render: makes the function that renders the map; None leaves the image metrics null, as no source does.
-    make_read_ids: makes the function that reads which of the run's planes the map shows; None leaves the metrics of
-        instances and surfaces null, as a run without planes does.
+    make_show: makes the function that renders the map and reads off which of these planes it shows; None leaves the
+        metrics of images and of what they show null, as no source does.
+    read_ahead: as in `read_frames`.
     Raises OutputError when the run was cut off before it wrote its trajectory, or a file of it is damaged, and
     EvaluationError when the input has changed since.
     """
@@ -102,20 +97,14 @@ def evaluate_run(
     }
     if groundtruth is not None:
         metrics |= trajectory_metrics(run.every_frame, run.keyframes, groundtruth, config)
-    if source is not None and make_render is not None:
-        if len(run.reports) > len(source):
-            raise EvaluationError(
-                f"{source.name} has {len(source)} frames now, but this run saw {len(run.reports)}; restore its input"
-            )
-        try:
-            poses = held_out_poses(run.reports, run.every_frame, config.holdout_interval)
-        except EvaluationError as error:
-            raise EvaluationError(f"{folder.trajectory}: {error}") from error
-        metrics |= image_metrics(source, poses, run.gaussians, make_render(), stop_requested)
-        read_ids = make_read_ids(run.planes) if make_read_ids is not None and run.planes and poses else None
-        if read_ids is not None:
-            metrics |= surface_metrics(source, poses, run.gaussians, read_ids, stop_requested)
-        metrics |= _scene_metrics(run, source, poses, config, read_ids, stop_requested)
+    if source is not None and make_show is not None:
+        poses = _poses(folder, run, source, config.holdout_interval)
+        truth = source.truth()
+        instances = None if truth is None or not run.planes else InstanceComparison(truth)
+        show = make_show(run.gaussians, run.planes or ())
+        metrics |= view_metrics(source, poses, show, instances, read_ahead=read_ahead, stop_requested=stop_requested)
+        known = None if stop_requested() else truth
+        metrics |= _scene_metrics(run, source, known, instances, config.truth_tolerance_s)
     return metrics
 
 
@@ -140,25 +129,35 @@ def _results(folder: RunFolder) -> _Results:
     )
 
 
+def _poses(folder: RunFolder, run: _Results, source: RgbdSource, interval: int) -> list[tuple[int, Matrix4]]:
+    """Those of the held-out frames. Raises EvaluationError for a source or a trajectory that is not the run's."""
+    if len(run.reports) > len(source):
+        raise EvaluationError(
+            f"{source.name} has {len(source)} frames now, but this run saw {len(run.reports)}; restore its input"
+        )
+    try:
+        return held_out_poses(run.reports, run.every_frame, interval)
+    except EvaluationError as error:
+        raise EvaluationError(f"{folder.trajectory}: {error}") from error
+
+
 def _scene_metrics(
     run: _Results,
     source: RgbdSource,
-    poses: Sequence[tuple[int, Matrix4]],
-    config: EvaluationConfig,
-    read_ids: ReadIds | None,
-    stop_requested: Callable[[], bool],
-) -> dict[str, Any]:
+    truth: SceneTruth | None,
+    instances: InstanceComparison | None,
+    tolerance_s: float,
+) -> Metrics:
     """What comparing with the scene itself gives; null for a recording, whose scene nobody knows."""
-    metrics: dict[str, Any] = dict.fromkeys((*INSTANCE_KEYS, FLOATER_KEY))
-    truth = source.truth()
+    metrics: Metrics = dict.fromkeys((*INSTANCE_KEYS, FLOATER_KEY))
     groundtruth = None if truth is None else source.groundtruth()  # in the truth's world, whatever else was compared
-    if truth is None or groundtruth is None or stop_requested():
+    if truth is None or groundtruth is None:
         return metrics
-    T_alignment = _alignment(run.every_frame, groundtruth, config.truth_tolerance_s)
+    T_alignment = _alignment(run.every_frame, groundtruth, tolerance_s)
     if T_alignment is not None:
         metrics[FLOATER_KEY] = floater_share(run.gaussians, truth, T_alignment)
-    if read_ids is not None and run.planes:
-        metrics |= instance_metrics(run.planes, run.gaussians, poses, truth, T_alignment, read_ids, stop_requested)
+    if instances is not None and run.planes:
+        metrics |= instances.metrics(run.planes, T_alignment)
     return metrics
 
 

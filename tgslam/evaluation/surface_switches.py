@@ -1,47 +1,22 @@
 """Identity switches where nobody has labelled the scene: what measurements show at one place should keep its id.
 
-The measured points of a frame fall into patches: cubes of the world, each with the face of the cube that the surface
-there is turned to, so that the two sides of a thin wall are two patches. A patch bears the id that nearly all of its
-pixels show, if they show one. What bore one id when it was last seen is one surface; where enough of it bears another
-id now, that is a switch. What comes into view later, and follows switches that have been counted since it was last
-seen, is the same switch. Neither the ids' own planes nor how the map was made have a part in what a patch is.
+What bore one id when it was last seen is one surface; where enough of it bears another id now, that is a switch. What
+comes into view later, and follows switches that have been counted since it was last seen, is the same switch. The
+places are patches (see `patches`): neither the ids' own planes nor how the map was made have a part in what those are.
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.camera import Camera
-from tgslam.datasets.source import RgbdSource
-from tgslam.errors import FrameError
 from tgslam.evaluation.panoptic import IDENTITY_SHARE, SHOWN_SHARE, IdImage
-from tgslam.evaluation.plane_metrics import MIN_AREA_M2, Metrics, ReadIds
-from tgslam.geometry import inverse, transform_points
-from tgslam.types import FloatImage, Gaussians, Matrix4
+from tgslam.evaluation.patches import Patches, patches_of
+from tgslam.evaluation.plane_metrics import MIN_AREA_M2
+from tgslam.types import FloatImage, Matrix4
 
 SURFACE_KEY = "plane_surface_switches_per_100"
-
-_CUBE_M = 0.1  # what is narrower is not judged; smaller cubes would be lost in the noise of far surfaces
-_FEWEST_PX = 4  # of a patch in a frame
-_AGREEING = 0.8  # of its pixels, for an id to be the patch's: those at the border of two planes have none
-_FLATNESS = 1.5  # times the variance along the normal that a patch has across it at least
-_LEAST_SPREAD_M = 0.005  # standard deviation across, likewise
-_LEAST_FACING = 0.15  # cosine of the most grazing angle at which a patch is judged
-_AXIS_BITS = 19  # of a cube's index along an axis: 52 km
-
-
-@dataclass(frozen=True)
-class Patches:
-    """What a frame shows, patch by patch, in ascending order of their keys."""
-
-    keys: NDArray[np.int64]  # [P] the same patch has the same key in every frame
-    ids: NDArray[np.int32]  # [P] that nearly all pixels show
-    pixels: NDArray[np.int64]  # [P]
-    areas_m2: NDArray[np.float64]  # [P] of the surface that those pixels show
 
 
 class SurfaceSwitches:
@@ -107,82 +82,3 @@ class SurfaceSwitches:
             much = part_px >= IDENTITY_SHARE * seen_px or float(patches.areas_m2[part].sum()) >= MIN_AREA_M2
             if much and part_px >= SHOWN_SHARE * image_px:
                 self._switches.append((self.frames, known, int(other)))
-
-
-def patches_of(depth_m: FloatImage, ids: IdImage, camera: Camera, T_wc: Matrix4) -> Patches:
-    """The patches of a frame that bear an id and face the camera well enough to tell how; see `SurfaceSwitches.add`."""
-    measured = depth_m > 0
-    rays = camera.rays()[measured]
-    z = depth_m[measured].astype(np.float64)
-    points = transform_points(T_wc, rays * z[:, None])
-    cubes = np.floor(points / _CUBE_M).astype(np.int64) + (1 << _AXIS_BITS - 1)
-    packed = (cubes[:, 0] << 2 * _AXIS_BITS) | (cubes[:, 1] << _AXIS_BITS) | cubes[:, 2]
-    cube, group, count = np.unique(packed, return_inverse=True, return_counts=True)
-    group = group.reshape(-1)
-    normals = _normals(points, group, count, T_wc[:3, 3])
-    cosine = np.abs(np.sum(normals[group] * (rays @ T_wc[:3, :3].T), axis=1))  # with a ray as long as z = 1 asks for
-    facing = np.bincount(group, cosine, len(cube)) / count
-    area_m2 = np.bincount(group, z**2 / (camera.fx * camera.fy), len(cube)) / np.maximum(facing, _LEAST_FACING)
-    axis = np.argmax(np.abs(normals), axis=1)
-    face = 2 * axis + (normals[np.arange(len(cube)), axis] > 0)
-    borne = _agreed(ids[measured], group, count)
-    # In order of the cubes, each of which has one normal in a frame, the keys are in order too
-    told = (count >= _FEWEST_PX) & (facing >= _LEAST_FACING) & (borne >= 0)
-    return Patches(((cube << 3) | face)[told], borne[told], count[told], area_m2[told])
-
-
-def _normals(
-    points: NDArray[np.float64], group: NDArray[np.intp], count: NDArray[np.intp], position: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """[G, 3] unit normals of the points [N, 3] of each group, along which they scatter least, turned to `position` [3].
-
-    Groups that scatter as little in another direction, as points on a line do, have none: 0.
-    """
-
-    def means(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.bincount(group, values, len(count)) / count
-
-    centre = np.stack([means(points[:, i]) for i in range(3)], axis=-1)
-    local = points - centre[group]
-    scatter = np.empty((len(count), 3, 3))
-    for i in range(3):
-        for j in range(i + 1):
-            scatter[:, i, j] = scatter[:, j, i] = means(local[:, i] * local[:, j])
-    spread, axes = np.linalg.eigh(scatter)
-    normals = axes[..., 0] * (spread[:, 1:2] >= np.maximum(_FLATNESS * spread[:, :1], _LEAST_SPREAD_M**2))
-    away = np.sum(normals * (position - centre), axis=-1, keepdims=True) < 0
-    return np.where(away, -normals, normals)
-
-
-def _agreed(ids: NDArray[np.int32], group: NDArray[np.intp], count: NDArray[np.intp]) -> NDArray[np.int32]:
-    """[G] the id that nearly all pixels [N] of each group show; -1 = none."""
-    result, borne = np.full(len(count), -1, np.int32), ids >= 0
-    span = np.int64(ids.max(initial=0)) + 1
-    pairs, pixels = np.unique(group[borne] * span + ids[borne], return_counts=True)
-    of, known = np.divmod(pairs, span)
-    agreed = pixels / count[of] >= _AGREEING
-    result[of[agreed]] = known[agreed]
-    return result
-
-
-def surface_metrics(
-    source: RgbdSource,
-    poses: Sequence[tuple[int, Matrix4]],
-    gaussians: Gaussians,
-    read_ids: ReadIds,
-    stop_requested: Callable[[], bool] = lambda: False,
-) -> Metrics:
-    """The value of `SURFACE_KEY` over the frames at `poses` (position, T_wc), in order; null on a request to stop.
-
-    A frame that cannot be read is left out.
-    """
-    switches = SurfaceSwitches(source.camera)
-    for position, T_wc in poses:
-        if stop_requested():
-            return {SURFACE_KEY: None}
-        try:
-            depth_m = source.read(position).depth_m
-        except FrameError:  # has been told of with the image metrics
-            continue
-        switches.add(depth_m, read_ids(gaussians, inverse(T_wc)), T_wc)
-    return {SURFACE_KEY: switches.per_100_frames}

@@ -135,16 +135,18 @@ class PoseGraph:
 
     def estimate(self) -> GraphEstimate:
         """As of the last `optimise`; what was added later is where it was guessed to be."""
-        if not self._keyframes:
+        if self._origin is None:
             raise GraphError("the pose graph has no keyframes")
         flat = gtsam.utilities.extractPose3(self._values)
         T_wc = np.tile(np.eye(4), (len(flat), 1, 1))
         T_wc[:, :3, :3], T_wc[:, :3, 3] = flat[:, :9].reshape(-1, 3, 3), flat[:, 9:]
+        keyframes, T_cw = np.array(sorted(self._keyframes), np.int64), inverse(T_wc)
+        T_cw[keyframes == self._origin[0]] = self._origin[1]  # to the last bit
         plane_ids = sorted(self._plane_ids)
         planes = [self._values.atOrientedPlane3(plane_key(plane)).planeCoefficients() for plane in plane_ids]
         return GraphEstimate(
-            np.array(sorted(self._keyframes), np.int64),
-            inverse(T_wc),
+            keyframes,
+            T_cw,
             np.array(plane_ids, np.int64),
             np.array(planes, np.float64).reshape(-1, 4),
         )

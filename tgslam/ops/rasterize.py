@@ -16,8 +16,6 @@ from tgslam.ops.render_images import ImageGradient, RenderImages
 from tgslam.ops.splats import FixedSplats, MapGradient, Splats
 from tgslam.types import Gaussians, Rendering
 
-MIN_OPACITY = 0.5  # below it a pixel of `Rendering.depth_m` has no depth
-
 __all__ = ["ImageGradient", "Rasterizer", "RenderImages"]
 
 
@@ -87,14 +85,10 @@ class Rasterizer:
         return self._splatting.backward(gaussians, self._pose, self._images, g, into)
 
     def render(self, gaussians: Gaussians | Splats, T_cw: ArrayLike) -> Rendering:
-        """Render to host arrays, with depth divided by opacity (0 where opacity < MIN_OPACITY)."""
+        """Render to host arrays; see `RenderImages.rendering`."""
         if isinstance(gaussians, Gaussians):
             gaussians = FixedSplats.of(gaussians)
-        images = self.forward(gaussians, T_cw)
-        opacity = runtime.to_host(images.opacity).copy()
-        depth = runtime.to_host(images.depth)
-        depth_m = np.where(opacity >= MIN_OPACITY, depth / np.maximum(opacity, MIN_OPACITY), 0.0).astype(np.float32)
-        return Rendering(runtime.to_host(images.colour).copy(), depth_m, opacity)
+        return self.forward(gaussians, T_cw).rendering()
 
     @property
     def tile_count(self) -> np.ndarray:

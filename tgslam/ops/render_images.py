@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tgslam.device import runtime
+from tgslam.types import Rendering
+
+MIN_OPACITY = 0.5  # below it a pixel of `Rendering.depth_m` has no depth
 
 
 @dataclass
@@ -17,6 +20,13 @@ class RenderImages:
     depth: np.ndarray  # [H, W] m, sum of blend weight times tangent-plane depth (not divided by opacity)
     opacity: np.ndarray  # [H, W]
     embedding: np.ndarray  # [H, W, 3] instance colour, Eq. 3; written only with `with_embedding`
+
+    def rendering(self) -> Rendering:
+        """Copies on the host, with depth divided by opacity (0 where opacity < MIN_OPACITY)."""
+        opacity = runtime.to_host(self.opacity).copy()
+        depth = runtime.to_host(self.depth)
+        depth_m = np.where(opacity >= MIN_OPACITY, depth / np.maximum(opacity, MIN_OPACITY), 0.0).astype(np.float32)
+        return Rendering(runtime.to_host(self.colour).copy(), depth_m, opacity)
 
 
 @dataclass

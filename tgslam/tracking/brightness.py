@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
-from scipy.sparse.linalg import spsolve
 
 from tgslam.camera import Camera
 from tgslam.geometry import inverse, transform_points
 from tgslam.map.keyframes import Keyframe
+from tgslam.tracking.exposure_steps import MAP, Course, Courses, Tie
 from tgslam.tracking.references import references_of
 from tgslam.types import Exposure
 
@@ -27,28 +25,13 @@ _CLIPPED = 0.03, 0.97  # intensities beyond are cut off, or nearly
 # Lambertian. What two surfaces in one view differ by says more, where it is more.
 _SYSTEMATIC = 0.03
 _SPREAD = 1.48  # standard deviation by median absolute deviation, of a normal distribution
-# Steps of the log gain from one keyframe to the next that are much smaller count as none. Beyond, the prior is flat: it
-# does not shrink what the views agree on, and any step costs as much.
-_NO_STEP = 0.005
-_STEP_COST = 0.5  # negative log likelihood
 _TRACKED = 0.05  # of the gain that the tracker had against the map, for a keyframe that shares no surface with others
 _WINDOW = 100  # latest keyframes whose gains are still open; those of earlier ones have settled
-_ROUNDS = 20  # of reweighting
-_CONVERGED = 1e-5
 
 
 class Ratio(NamedTuple):
     """What two keyframes' images say of their gains: that of the first over that of the second one."""
 
-    log_gain: float
-    sigma: float
-
-
-class Tie(NamedTuple):
-    """A measured difference of log gains, that of `keyframe` less that of `other`; -1 is the map, whose gain is 1."""
-
-    keyframe: int
-    other: int
     log_gain: float
     sigma: float
 
@@ -63,6 +46,8 @@ class KeyframeExposures:
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
         self._ties: list[Tie] = []
+        self._moves: list[bool] = []  # of each keyframe, whether its exposure differs from that of the one before
+        self._nearest: list[float] = []  # of each, its log gain less that of the one before, as measured between them
 
     def add(self, keyframes: Sequence[Keyframe]) -> None:
         """Measure the latest keyframe, whose exposure is as tracked, and set anew those of all that it bears on."""
@@ -74,14 +59,16 @@ class KeyframeExposures:
             Tie(latest, other, *ratio)
             for other in self._partners(keyframes)
             if (ratio := gain_ratio(keyframes[latest], keyframes[other], self._camera))
-        ]
-        if found:
-            log_gains[latest] = log_gains[found[0].other] + found[0].log_gain
-        else:
-            found = [Tie(latest, -1, float(log_gains[latest]), _TRACKED)]
-        first = max(len(keyframes) - _WINDOW, 1)  # the very first keyframe is what the map is as bright as
+        ] or [Tie(latest, MAP, float(log_gains[latest]), _TRACKED)]
+        nearest = found[0].log_gain + (log_gains[found[0].other] if found[0].other != MAP else 0.0)
+        self._nearest = [*self._nearest, nearest - log_gains[latest - 1]][-_WINDOW:]
+        self._moves = [*self._moves, False][-_WINDOW:]
+        first = latest + 1 - len(self._moves)  # at least 1: the very first keyframe is what the map is as bright as
         self._ties = [tie for tie in self._ties if tie.keyframe >= first] + found
-        for keyframe, log_gain in zip(keyframes[first:], solve(self._ties, log_gains, first), strict=True):
+        course = Course(log_gains[first:], np.array(self._moves))
+        best = Courses(self._ties, log_gains[:first]).best(course, np.array(self._nearest))
+        self._moves = best.moves.tolist()
+        for keyframe, log_gain in zip(keyframes[first:], best.log_gains, strict=True):
             keyframe.expose(Exposure(float(np.exp(log_gain))))
 
     def _partners(self, keyframes: Sequence[Keyframe]) -> list[int]:
@@ -114,29 +101,3 @@ def gain_ratio(keyframe: Keyframe, other: Keyframe, camera: Camera) -> Ratio | N
     log_ratios = np.log(there[sound] / here[sound])
     median = float(np.median(log_ratios))
     return Ratio(median, max(_SYSTEMATIC, _SPREAD * float(np.median(np.abs(log_ratios - median)))))
-
-
-def solve(ties: Sequence[Tie], log_gains: NDArray[np.float64], first: int) -> NDArray[np.float64]:
-    """The most likely log gains near those [K], from number `first` on; by iteratively reweighted least squares.
-
-    The errors of ties have a Cauchy distribution, so that wrong ties do not count. Steps between keyframes are none or
-    free (the Geman-McClure function).
-    """
-    columns, steps = np.array(ties, np.float64).T, np.arange(first, len(log_gains))
-    k, other = (np.concatenate([columns[i].astype(int), at]) for i, at in ((0, steps), (1, steps - 1)))
-    measured, sigma = (np.append(columns[i], np.full(len(steps), x)) for i, x in ((2, 0.0), (3, _NO_STEP)))
-    gains = np.append(log_gains, 0.0)  # at -1 that of the map
-    signs = np.concatenate([np.ones(len(k)), -np.ones(len(k))])
-    ends, rows = np.concatenate([k, other]) - first, np.tile(np.arange(len(k)), 2)
-    free = ends >= 0
-    differences = csr_matrix((signs[free], (rows[free], ends[free])), shape=(len(k), len(steps)))
-    for _ in range(_ROUNDS):
-        error = measured - (gains[k] - gains[other])
-        weight = 1.0 / (sigma**2 + error**2)
-        weight[-len(steps) :] = 2.0 * _STEP_COST * (_NO_STEP * weight[-len(steps) :]) ** 2
-        weighted = differences.T.multiply(weight).tocsc()
-        change = spsolve((weighted @ differences).tocsc(), weighted @ error)
-        gains[first:-1] += change
-        if np.abs(change).max() < _CONVERGED:
-            break
-    return gains[first:-1]

@@ -60,12 +60,10 @@ _CLOSURES = Column("closures", "closures", 1)
 _PLANES = Column("plane_pq", "plane PQ", 3)
 _FPS = Column("fps", "frames/s", 2)
 
-_STRUCTURE = ("planes.enabled=true", "closures.enabled=true")
-
 INTERVAL = Study(
     name="interval",
     title="structure closures at every k-th keyframe (Table 4)",
-    common=("planes.enabled=true", "closures.formulation=closures"),
+    common=("closures.formulation=closures", "loops.enabled=false"),
     variants=(
         *(Variant(f"every {k}", ("closures.enabled=true", f"closures.interval={k}")) for k in (4, 10, 25)),
         Variant("never", ("closures.enabled=false",)),
@@ -76,10 +74,10 @@ INTERVAL = Study(
 STRUCTURE = Study(
     name="structure",
     title="what structure does where there is little texture (Table 5)",
-    common=(),
+    common=("loops.enabled=false",),
     variants=(
-        Variant("off", ("planes.enabled=false", "closures.enabled=false")),
-        *(Variant(name, (*_STRUCTURE, f"closures.formulation={name}")) for name in ("closures", "landmarks", "both")),
+        Variant("off", ("planes.enabled=false",)),
+        *(Variant(name, (f"closures.formulation={name}",)) for name in ("closures", "landmarks", "both")),
     ),
     columns=(*_TRAJECTORY, _TRACKED, *_IMAGES, _CLOSURES, _PLANES, _FLOATERS, _FPS),
     scenes=("corridor", "blank"),
@@ -111,7 +109,7 @@ TERMS = Study(
 VIEWPOINTS = Study(
     name="viewpoints",
     title="sparse global viewpoints (section 3.4): which earlier keyframes are refined with the window",
-    common=_STRUCTURE,
+    common=(),
     variants=tuple(Variant(name, (f"mapping.anchors={name}",)) for name in ("structure", "random", "none")),
     columns=(*_TRAJECTORY, *_IMAGES, _CLOSURES, _PLANES, _FPS),
     scenes=("corridor", "room"),

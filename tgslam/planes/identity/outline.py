@@ -20,7 +20,7 @@ class Outline:
         """A plane without outlines, as one of a few cells is, has no bounds."""
         self._axes = tangent_axes(plane.normal_w)
         polygons = [polygon @ self._axes.T for polygon in plane.polygons_w]
-        self._inside = np.zeros((0, 0), np.uint8)
+        self._inside = np.zeros((0, 0), bool)
         if not polygons:
             return
         corners = np.concatenate(polygons)
@@ -33,14 +33,19 @@ class Outline:
             cv2.fillPoly(drawn, [np.rint((polygon - self._low) / self._step).astype(np.int32)], 1)
         reach = round(margin_m / self._step)
         around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-        self._inside = cv2.dilate(drawn, around)
+        self._inside = np.pad(cv2.dilate(drawn, around) > 0, 1)  # beyond it is what its border says: outside
 
     def holds(self, points_w: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which of points [N, 3] m lie over the outlines or within the margin of them."""
         if not self._inside.size:
             return np.ones(len(points_w), bool)
-        column, row = np.rint((points_w @ self._axes.T - self._low) / self._step).astype(np.intp).T
+        x, y, z = points_w.T
+        column, row = (
+            np.rint((x * axis[0] + y * axis[1] + z * axis[2] - low) / self._step + 1.0)
+            for axis, low in zip(self._axes, self._low, strict=True)
+        )
         rows, columns = self._inside.shape
-        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        inside[inside] = self._inside[row[inside], column[inside]] > 0
-        return np.asarray(inside)
+        held: NDArray[np.bool_] = self._inside[
+            np.clip(row, 0, rows - 1).astype(np.intp), np.clip(column, 0, columns - 1).astype(np.intp)
+        ]
+        return held
