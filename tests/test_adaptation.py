@@ -111,6 +111,16 @@ def test_a_noisy_sensor_is_tracked_as_well_as_its_noise_allows(
     assert ate_m(slam, room) < allowed_m
 
 
+@pytest.mark.parametrize(("size", "noise", "per_m2", "unit_m"), [(1.0, 0.0, 0.0015, 1.0), (0.125, 0.12, 0.12, 0.25)])
+def test_the_log_says_what_was_settled(
+    room: SyntheticSource, frames: list[Frame], size: float, noise: float, per_m2: float, unit_m: float
+) -> None:
+    (first,) = scaled(frames[:1], size)
+    report = Slam(room.camera, Config()).process_frame(noisier(first, noise, 0.0))
+    assert report.measures["depth_sigma_per_m2"] == pytest.approx(per_m2, rel=0.3)
+    assert report.measures["unit_m"] == unit_m
+
+
 def test_noise_that_a_config_gives_is_not_learnt_anew(room: SyntheticSource, frames: list[Frame]) -> None:
     noisy = [noisier(frame, 0.015, 0.4) for frame in frames[:4]]
     slam = Slam(room.camera, load(None, ["loss.depth_sigma_per_m2=0.0015"]))

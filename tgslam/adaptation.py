@@ -34,11 +34,14 @@ class Slam:
 
         Raises FrameError, with nothing changed, for a frame with next to no depth or of another size than the camera's.
         """
-        if not self._started:
-            self._adapt(self._check(frame))
-        report = self._slam.process_frame(self._in_units(frame))
+        if self._started:
+            return self._report_in_metres(self._slam.process_frame(self._in_units(frame)))
+        self._adapt(self._check(frame))
+        report = self._report_in_metres(self._slam.process_frame(self._in_units(frame)))
         self._started = True
-        return self._report_in_metres(report)
+        per_m2 = self._slam.config.loss.noise.per_m2 / self._unit_m
+        settled = {"depth_sigma_per_m2": per_m2, "unit_m": self._unit_m}
+        return dataclasses.replace(report, measures=report.measures | settled)
 
     def finish(self) -> None:
         """The final refinement of the map, after the last frame."""
