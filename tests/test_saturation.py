@@ -33,13 +33,13 @@ def covers(colour: np.ndarray, times: int = 3) -> list[np.ndarray]:
 
 def test_one_saturated_channel_is_enough() -> None:
     colour = np.full((*CAMERA.shape, 3), 0.5, np.float32)
-    colour[40:80, 64:96, 1] = 1.0
+    colour[40:80, 32:128, 1] = 1.0
     found = covers(colour)
     assert [cover.shape for cover in found] == [(60, 80), (30, 40), (15, 20)]
     for level, cover in enumerate(found):
         step = 2 ** (level + 1)
         expected = np.ones_like(cover)
-        expected[40 // step : 80 // step, 64 // step : 96 // step] = 0.0
+        expected[40 // step : 80 // step, 32 // step : 128 // step] = 0.0
         np.testing.assert_allclose(cover, expected, atol=1e-6)
         assert (cover >= WHOLE).sum() == expected.sum()
 

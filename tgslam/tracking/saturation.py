@@ -13,7 +13,7 @@ from tgslam.device import runtime
 
 WHOLE = 0.99  # share of some 6 x 6 pixels that is not saturated, from which on their colours count
 _SATURATED = 254.5 / 255.0  # of any channel
-_LEAST_SHARE = 0.01  # of an image; lamps and glints take less, and mislead nobody
+_LEAST_SHARE = 0.1  # of an image; lamps, windows and glints take less, and mislead nobody
 _SAMPLE_STEP_PX = 8
 
 
