@@ -26,7 +26,8 @@ RHS = TRIANGLE
 CANDIDATES, MATCHED, INLIERS, DEPTH_SUM, COLOUR_SUM = (RHS + UNKNOWNS + k for k in range(5))
 W, W_L, W_M, W_LL, W_LM = (COLOUR_SUM + 1 + k for k in range(5))  # moments of live (L) and model (M) intensity
 LIVE_PIXELS = W_LM + 1  # with depth
-SUMS = LIVE_PIXELS + 1
+SHOWN = LIVE_PIXELS + 1  # matched pixels whose colours count
+SUMS = SHOWN + 1
 PACKED_SUMS = -(-SUMS // LANES)  # vectors that hold a row of sums
 PADDED_SUMS = PACKED_SUMS * LANES
 
@@ -55,11 +56,13 @@ PADDED_SUMS = PACKED_SUMS * LANES
 ) = range(20)
 SETTINGS = POSE + 12
 
-# What a live pixel holds: m, intensity, its gradient and that one's length (G of Eq. 10) in 1/px
+# What a live pixel holds: m, intensity, its gradient and that one's length (G of Eq. 10) in 1/px, negative where the
+# sensor was saturated
 LIVE_DEPTH, LIVE_GREY, LIVE_GX, LIVE_GY, LIVE_STRENGTH = range(5)
 LIVE = 5  # of them
 # What a model pixel holds: its surface (a normal in the model camera's frame, 0 = none, then the depth in m, 0 = none,
-# negative at the rim of the map), and its intensity with the first and second derivatives by the pixel
+# negative at the rim of the map and where a measured image is saturated), and its intensity with the first and second
+# derivatives by the pixel
 MODEL_DEPTH = 3
 SURFACE = 4
 GREY, GX, GY, GXX, GXY, GYY = range(6)
@@ -211,8 +214,8 @@ def add_residuals(
     gate = gate_at(settings, strength)
     model_depth = magnitude(surface_depth)
     candidate = seen * indicator(filled(z, 0.0), model_depth)
-    # at the map's rim colours fade into black: a pull that does not depend on the pose
-    firm = indicator(filled(z, 0.0), surface_depth)
+    # at the map's rim colours fade into black: a pull that does not depend on the pose; and saturated ones are none
+    firm = indicator(filled(z, 0.0), surface_depth) * (1.0 - indicator(strength, filled(z, 0.0)))
     # depth: e is the length of the residual, whose sign is the distance's
     # by the model's depth: by the measured one, what errs towards the camera would count for more. Of a model that errs
     # as much, by the mean of both
@@ -269,7 +272,8 @@ def add_residuals(
     add(sums, row, MATCHED, matched)
     add(sums, row, INLIERS, on_surface * indicator(e, filled(e, _INLIER_SIGMAS)))
     add(sums, row, DEPTH_SUM, on_surface * e)
-    add(sums, row, COLOUR_SUM, matched * magnitude(e_colour))
+    add(sums, row, COLOUR_SUM, matched * firm * magnitude(e_colour))
+    add(sums, row, SHOWN, matched * firm)
     add(sums, row, W, robust)
     add(sums, row, W_L, robust * live)
     add(sums, row, W_M, robust * model)

@@ -318,6 +318,23 @@ def mark_rims(
 
 
 @ti.kernel
+def mark_saturated(
+    half_cover: F2,  # [H // 2, W // 2] share that is not saturated
+    whole: ti.f32,
+    live: F4,  # [H, B, LIVE, 16], B = ceil(W / 16)
+):
+    """Negative strength where the 3x3 blocks of 2x2 pixels round a pixel hold less than that in the mean."""
+    for s in range(live.shape[0] * SPLIT):
+        i, begin, end = segment(s, live.shape[1])
+        row = ti.min(i // 2, half_cover.shape[0] - 1)
+        for block in range(begin, end):
+            for lane in range(LANES):
+                column = ti.min((block * LANES + lane) // 2, half_cover.shape[1] - 1)
+                if mean_around(half_cover, row, column) < whole:
+                    live[i, block, LIVE_STRENGTH, lane] = -1.0
+
+
+@ti.kernel
 def sobel_magnitude(
     image: F2,  # [H, W]
     magnitude: F2,  # [H, W] per px, out

@@ -45,6 +45,8 @@ def image_pair(height, width, seed=0, holes=0.15):
     live = {"depth": noisy_depth(), "grey": live_grey}
     live["gx"], live["gy"] = sobel(live_grey)
     live["gate"] = np.where(rng.random(depth.shape) < 0.3, 1.0, rng.random(depth.shape))
+    live["saturated"] = np.random.default_rng(seed + 100).random(depth.shape) < 0.1
+    live["gate"][live["saturated"]] = 1.0
     model = {"depth": noisy_depth(), "normal": normal, "grey": model_grey}
     model["depth"][:, -width // 4 :] *= -1.0  # the map's rim
     model["gx"], model["gy"] = sobel(model_grey)
@@ -77,7 +79,8 @@ def run_kernel(settings, T_ml, live, model):
     values[: alignment.GATE_LOW] = astuple(settings)
     values[alignment.GATE_INVERSE_RANGE] = 1.0  # a gradient magnitude of 1 - T: the gate is T
     values[alignment.POSE :] = T_ml[:3].reshape(12)
-    pixels = in_blocks([live["depth"], live["grey"], live["gx"], live["gy"], 1.0 - live["gate"]])
+    strength = np.where(live["saturated"], -1.0, 1.0 - live["gate"])
+    pixels = in_blocks([live["depth"], live["grey"], live["gx"], live["gy"], strength])
     surface = aligned(np.concatenate([model["normal"], model["depth"][..., None]], axis=-1))
     unused = [np.full((height, width), np.nan)] * 2
     texture = aligned(np.stack([model[name] for name in TEXTURE] + unused, axis=-1))
@@ -108,12 +111,13 @@ def by_name(partial):
         "inliers": sums[alignment.INLIERS],
         "depth_sum": sums[alignment.DEPTH_SUM],
         "colour_sum": sums[alignment.COLOUR_SUM],
+        "shown": sums[alignment.SHOWN],
         "moments": sums[[alignment.W, alignment.W_L, alignment.W_M, alignment.W_LL, alignment.W_LM]],
     }
 
 
 def assert_same(found, expected, relative=2e-5):
-    for name in ("candidates", "matched", "inliers"):
+    for name in ("candidates", "matched", "inliers", "shown"):
         assert found[name] == expected[name], name
     for name in ("depth_sum", "colour_sum", "moments"):
         np.testing.assert_allclose(found[name], expected[name], rtol=relative, err_msg=name)
@@ -217,7 +221,7 @@ def slopes(u, v):
 def smooth_pair(height, width):
     v, u = np.mgrid[:height, :width].astype(float)
     live, model = image_pair(height, width, seed=3, holes=0.0)
-    live["gate"][:] = 0.5
+    live["gate"][:], live["saturated"][:] = 0.5, 0.0
     model["grey"] = intensity(u, v)
     model["gx"], model["gy"] = slopes(u, v)
     ones = np.ones((height, width))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import types
 import typing
 from collections import defaultdict
 from collections.abc import Iterator
@@ -229,6 +230,9 @@ def _field_values(hint: Any, field: dataclasses.Field[Any]) -> st.SearchStrategy
         return st.text(
             st.characters(codec="utf-8", exclude_characters="\r\x85\u2028\u2029", exclude_categories=("Cs", "Cc"))
         )
+    if isinstance(hint, types.UnionType):
+        (given_hint,) = (option for option in typing.get_args(hint) if option is not type(None))
+        return st.none() | _field_values(given_hint, field)
     assert typing.get_origin(hint) is tuple
     elements = typing.get_args(hint)
     size = None if elements[-1] is Ellipsis else len(elements)

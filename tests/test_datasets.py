@@ -15,7 +15,7 @@ from tgslam.camera import Camera
 from tgslam.config.input_settings import DatasetConfig, SyntheticConfig
 from tgslam.datasets import FrameRange, RgbdSource, open_source, parse_frame_slice
 from tgslam.datasets.calibration import Calibration, resolve
-from tgslam.datasets.image_files import Undistorter
+from tgslam.datasets.image_files import Undistorter, read_colour, unused_bits
 from tgslam.datasets.time_matching import associate_times
 from tgslam.errors import ConfigError, DatasetError, FrameError
 from tgslam.geometry import inverse, transform_points
@@ -110,6 +110,27 @@ def test_grey_and_16_bit_colour_images_are_converted(folder: Path) -> None:
     source = opened(folder)
     np.testing.assert_allclose(source.read(0).colour, np.repeat(colour_of(0)[..., :1], 3, 2) / 255.0, atol=1e-6)
     np.testing.assert_allclose(source.read(1).colour, colour_of(1) / 255.0, atol=1.01 / 255)
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14])
+def test_colour_that_leaves_bits_unused_is_not_read_as_black(
+    folder: Path, caplog: pytest.LogCaptureFixture, bits: int
+) -> None:
+    for k in range(3):
+        write_image(folder / f"rgb/{k}.png", colour_of(k)[..., ::-1].astype(np.uint16) << (bits - 8))
+    source = opened(folder)
+    assert f"colour uses {bits} of its 16 bits" in caplog.text
+    for k in range(3):
+        np.testing.assert_allclose(source.read(k).colour, colour_of(k) / 255.0, atol=1e-6)
+
+
+def test_colour_brighter_than_the_images_that_told_its_bits_is_saturated(folder: Path) -> None:
+    write_image(folder / "rgb/0.png", np.full((H, W, 3), 900, np.uint16))
+    write_image(folder / "rgb/1.png", np.full((H, W, 3), 60_000, np.uint16))
+    assert read_colour(folder / "rgb/0.png", unused_bits([folder / "rgb/0.png"])).max() == 900 >> 2
+    assert (read_colour(folder / "rgb/1.png", 6) == 255).all()
+    assert unused_bits([folder / "rgb/0.png", folder / "rgb/1.png"]) == 0
+    assert unused_bits([folder / "none.png", folder / "rgb/0.png"]) == 6
 
 
 def test_indices_outside_the_sequence(folder: Path) -> None:

@@ -17,7 +17,7 @@ from tgslam.geometry import inverse, matrix_from_quat_wxyz, so3_exp, transform_p
 from tgslam.mapping.fusion import depth_pyramid, fused_depth, sample, turned
 from tgslam.types import Frame
 
-SIGMA_PER_M2 = LossConfig().depth_sigma_per_m2
+SIGMA_PER_M2 = LossConfig().noise.per_m2
 
 # Depth
 

@@ -21,9 +21,9 @@ RANKS = (
     {"planes", "synthetic"},
     {"recognition"},
     {"map"},
-    {"boundary", "graph", "keyframing", "mapping", "preparation", "tracking"},
+    {"boundary", "graph", "keyframing", "mapping", "preparation", "sensing", "tracking"},
     {"assembly", "datasets", "record", "slam"},
-    {"evaluation", "output", "recording"},
+    {"adaptation", "evaluation", "output", "recording"},
     {"pipeline", "saving"},
     {"bench"},
     {"cli"},
@@ -31,7 +31,7 @@ RANKS = (
 )
 RANKED = {name: rank for rank, names in enumerate(RANKS) for name in names}
 # What must never see ground truth
-SYSTEM = {"assembly", "boundary", "preparation", "record", "slam"}
+SYSTEM = {"adaptation", "assembly", "boundary", "preparation", "record", "sensing", "slam"}
 SYSTEM |= {"graph", "keyframing", "map", "mapping", "planes", "recognition", "tracking"}
 # Rooms that hold kernels' arguments themselves; all others go through `ops`
 KERNEL_USERS = {"kernels", "ops", "synthetic", "bench"}

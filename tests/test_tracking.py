@@ -511,7 +511,8 @@ def live_images(level: LiveLevel) -> dict[str, np.ndarray]:
     pixels = pixels.reshape(level.camera.height, -1, alignment.LIVE)[:, : level.camera.width]
     images = dict(zip(("depth", "grey", "gx", "gy"), np.moveaxis(pixels, -1, 0), strict=False))
     strength = pixels[..., alignment.LIVE_STRENGTH]
-    return images | {"gate": 1 - np.clip((strength - level.gate_low) * level.gate_inverse_range, 0, 1)}
+    gate = 1 - np.clip((strength - level.gate_low) * level.gate_inverse_range, 0, 1)
+    return images | {"gate": gate, "saturated": strength < 0}
 
 
 def model_images(level: ModelLevel) -> dict[str, np.ndarray]:
@@ -533,7 +534,7 @@ def test_the_information_is_how_the_cost_grows_with_the_pose():
     model = model_images(ModelPyramid(TINY, 0, 1, loss.noise, ModelSettings()).update(scene.forward(None, T_mw))[0])
     settings = reference.Settings(
         TINY.fx, TINY.fy, TINY.cx, TINY.cy, result.exposure.gain, result.exposure.bias,
-        loss.depth_sigma_per_m2, RESIDUALS.max_distance_sigmas,
+        loss.noise.per_m2, RESIDUALS.max_distance_sigmas,
         loss.expert.penalties.charbonnier_depth_sigmas, loss.expert.texture.gate_depth_boost,
         RESIDUALS.sigma_colour, RESIDUALS.sigma_gradient,
         RESIDUALS.weight_depth, RESIDUALS.weight_colour, RESIDUALS.weight_gradient,

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from tgslam.adaptation import Slam
     from tgslam.camera import Camera
     from tgslam.config.loader import load as load_config
     from tgslam.config.schema import Config
     from tgslam.errors import TgslamError
     from tgslam.recording import Recording, open_recording
     from tgslam.saving import save_run
-    from tgslam.slam import Slam
     from tgslam.types import Frame, FrameReport, FrameStatus, Gaussians, Plane, Trajectory
 
 __version__ = "0.1.0"
@@ -44,7 +44,7 @@ _MODULES = {
     "Camera": "camera",
     "Config": "config.schema",
     "Recording": "recording",
-    "Slam": "slam",
+    "Slam": "adaptation",
     "TgslamError": "errors",
     "load_config": "config.loader",
     "open_recording": "recording",

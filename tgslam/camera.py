@@ -101,3 +101,6 @@ class SensorNoise:
     def sigma_m(self, depth_m: NDArray[Any]) -> NDArray[Any]:
         """Standard deviations [...] m of measured depths [...] m, of their dtype."""
         return self.per_m2 * depth_m**2
+
+
+USUAL_NOISE = SensorNoise(0.0015)  # a Kinect's, and that of most sensors for rooms within a factor of two

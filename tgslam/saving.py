@@ -6,10 +6,10 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from tgslam import __version__
+from tgslam.adaptation import Slam
 from tgslam.output.log import FrameLog
 from tgslam.output.run_folder import RunFolder, RunRecord, RunState
 from tgslam.output.run_results import write_results
-from tgslam.slam import Slam
 from tgslam.types import FrameReport
 
 

@@ -112,9 +112,9 @@ def pixel(s, T_ml, live, model, u, v):
         result.depth = Term(np.array([distance * scale]), scale * (n @ moves)[None], weight, s.charbonnier_depth)
     slope = np.array([bilinear(model[name], um, vm) for name in ("gx", "gy")])
     e = np.array([result.model - s.gain * result.live - s.bias])
-    result.colour_sigmas = abs(e[0]) / s.sigma_colour
-    if rim:
+    if rim or live["saturated"][v, u]:
         return result
+    result.colour_sigmas = abs(e[0]) / s.sigma_colour
     result.colour = Term(e / s.sigma_colour, (slope @ shifts)[None] / s.sigma_colour, s.weight_colour)
     if gate < 1:
         gxx, gxy, gyy = (bilinear(model[name], um, vm) for name in ("gxx", "gxy", "gyy"))
@@ -155,6 +155,7 @@ def normal_equations(s, T_ml, live, model):
         "b": b,
         "candidates": len(found),
         "matched": len(matched),
+        "shown": len(firm),
         "inliers": (depth < INLIER_SIGMAS).sum(),
         "depth_sum": depth.sum(),
         "colour_sum": sum(p.colour_sigmas for p in matched),

@@ -40,7 +40,7 @@ def parts(colour, depth, opacity, gt, gain, bias, config, min_opacity=0.0):
     inner[BORDER:-BORDER, BORDER:-BORDER] = mask[BORDER:-BORDER, BORDER:-BORDER]
     texture = 1 - gt["gate"]
     measured = (gt["depth"] > 0) & (opacity > penalties.min_depth_opacity)
-    sigma = config.depth_sigma_per_m2 * np.where(measured, gt["depth"], 1) ** 2
+    sigma = config.noise.per_m2 * np.where(measured, gt["depth"], 1) ** 2
     residual = (depth / np.where(measured, opacity, 1) - gt["depth"]) / sigma
     geo = (1 + boost * gt["gate"]) * charbonnier(residual, penalties.charbonnier_depth_sigmas)
     l1 = charbonnier(gain * colour + bias - gt["colour"], penalties.charbonnier_colour).mean(axis=2)

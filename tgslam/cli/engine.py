@@ -36,7 +36,7 @@ def start_device(name: str, threads: int = 0) -> str:
 def make_system(camera: Camera, config: Config) -> System:
     """The SLAM system for frames of `camera`."""
     with quick_import():
-        from tgslam.slam import Slam
+        from tgslam.adaptation import Slam
 
     return Slam(camera, config)
 

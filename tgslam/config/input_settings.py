@@ -42,6 +42,7 @@ class SyntheticConfig:
     width: int = setting(320, 32, 4096, doc="Width of the images, px.")
     height: int = setting(240, 32, 4096, doc="Height of the images, px.")
     noise: bool = setting(True, doc="Depth has noise and holes like a Kinect's.")
+    noise_factor: float = setting(1.0, 0.01, 100.0, doc="Noise of depth, and its steps, in those of a Kinect.")
     exposure_change: float = setting(
         0.0, 0.0, 1.0, doc="Amplitude of a slow change of the camera's gain, as a part of it; 0 = none."
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from tgslam.camera import SensorNoise
+from tgslam.camera import USUAL_NOISE, SensorNoise
 from tgslam.config.setting import setting
 
 
@@ -185,8 +185,12 @@ class LossConfig:
     gate: bool = setting(
         True, doc="Colour counts by how much texture a pixel has (Eq. 11). Off: T = 0 everywhere, and all count alike."
     )
-    depth_sigma_per_m2: float = setting(
-        0.0015, 1e-6, 1.0, doc="The sensor's noise: the standard deviation of a depth z is this * z^2; 1/m."
+    depth_sigma_per_m2: float | None = setting(
+        None,
+        1e-6,
+        100.0,
+        doc="The sensor's noise: the standard deviation of a depth z is this * z^2; 1/m. null: learnt from the first "
+        "frame, 0.0015 unless that is far noisier.",
     )
     weight_l1: float = setting(1.0, 0.0, 100.0, doc="Weight of colour in E_pho.")
     weight_grad: float = setting(0.5, 0.0, 100.0, doc="Weight of gradients in E_pho.")
@@ -203,5 +207,5 @@ class LossConfig:
 
     @property
     def noise(self) -> SensorNoise:
-        """The sensor's."""
-        return SensorNoise(self.depth_sigma_per_m2)
+        """The sensor's; the usual one while it is not known."""
+        return USUAL_NOISE if self.depth_sigma_per_m2 is None else SensorNoise(self.depth_sigma_per_m2)

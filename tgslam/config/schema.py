@@ -21,6 +21,13 @@ class SystemConfig:
     """What the system itself reads: settings of how frames become poses, a map and planes."""
 
     seed: int = setting(0, 0, 2**31 - 1, doc="Seed of all that is random: two runs of one seed are equal.")
+    unit_m: float | None = setting(
+        None,
+        1e-6,
+        1e6,
+        doc="Settings in metres are for rooms; in a world of another size they count in units of so many m. null: told "
+        "from the first frame, 1 for rooms.",
+    )
     tracking: TrackingConfig = dataclasses.field(default_factory=TrackingConfig)
     keyframes: KeyframeConfig = dataclasses.field(default_factory=KeyframeConfig)
     seeding: SeedingConfig = dataclasses.field(default_factory=SeedingConfig)

@@ -47,7 +47,7 @@ class SyntheticSource:
         if self._config.noise:
             rng = np.random.default_rng((self._seed, index))
             colour = sensor.noisy_colour(colour, rng)
-            depth_m = sensor.noisy_depth(depth_m, view.cosine, rng)
+            depth_m = sensor.noisy_depth(depth_m, view.cosine, rng, self._config.noise_factor)
         return Frame(index, self._time_s(index), colour, depth_m)
 
     def clean(self, index: int) -> Frame:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 from tgslam.camera import Camera
@@ -14,6 +15,9 @@ from tgslam.datasets.truth import SceneTruth
 from tgslam.errors import DatasetError, FrameError
 from tgslam.pixels import colour_as_float
 from tgslam.types import Frame, Trajectory
+
+_log = logging.getLogger(__name__)
+_SAMPLE_IMAGES = 4  # of a recording, that tell its colours' range
 
 
 class FolderSource:
@@ -32,6 +36,7 @@ class FolderSource:
         Raises DatasetError if there is none, and ConfigError if the calibration is for images of another size.
         """
         width, height = _image_size(name, pairs)
+        self._unused_bits = _unused_bits(name, pairs)
         check_size(calibration, width, height, name)
         self._name = name
         self._camera = calibration.camera(width, height)
@@ -67,7 +72,7 @@ class FolderSource:
         if not 0 <= index < len(self._pairs):
             raise IndexError(f"frame {index} of {self._name}: it has frames 0 to {len(self._pairs) - 1}")
         pair = self._pairs[index]
-        rgb, raw = images.read_colour(pair.colour), images.read_raw_depth(pair.depth)
+        rgb, raw = images.read_colour(pair.colour, self._unused_bits), images.read_raw_depth(pair.depth)
         self._check_sizes(pair, rgb.shape[:2], raw.shape)
         if self._undistorter is not None:
             rgb, raw = self._undistorter.colour(rgb), self._undistorter.depth(raw)
@@ -112,3 +117,12 @@ def _image_size(name: str, pairs: list[ImagePair]) -> tuple[int, int]:
         else:
             return width, height
     raise DatasetError(f"{name}: none of its {len(pairs)} colour images can be read; the first: {first_error}")
+
+
+def _unused_bits(name: str, pairs: list[ImagePair]) -> int:
+    """See `images.unused_bits`; told by a few images of the recording."""
+    some = range(0, len(pairs), max(1, len(pairs) // _SAMPLE_IMAGES))
+    bits = images.unused_bits([pairs[index].colour for index in some])
+    if bits:
+        _log.warning("%s: colour uses %d of its 16 bits; it is read as if white were 2^%d", name, 16 - bits, 16 - bits)
+    return bits

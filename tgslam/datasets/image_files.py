@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -16,10 +18,31 @@ from tgslam.types import FloatImage
 _PNG_START, _PNG_END = b"\x89PNG", b"IEND"
 
 
-def read_colour(path: Path) -> NDArray[np.uint8]:
-    """An image file -> [H, W, 3] RGB, 8 bits. Grey, 16-bit and alpha images are converted. Raises FrameError."""
-    bgr = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+def read_colour(path: Path, unused_bits: int = 0) -> NDArray[np.uint8]:
+    """An image file -> [H, W, 3] RGB, 8 bits. Grey, 16-bit and alpha images are converted. Raises FrameError.
+
+    unused_bits: highest bits of 16 that are always 0, as with 4 of a camera that gives 12; see `unused_bits`.
+    """
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    bgr = _decode(path, flags | cv2.IMREAD_ANYDEPTH if unused_bits else flags)
+    if bgr.dtype == np.uint16:
+        bgr = np.minimum(bgr >> (8 - unused_bits), 255).astype(np.uint8)
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+
+
+def unused_bits(paths: Sequence[Path]) -> int:
+    """How many of the highest bits no pixel of some 16-bit images uses; 0 for images of 8 bits.
+
+    An even number, as cameras give 10, 12 or 14 bits; at least 8 are left. Images that cannot be read do not count.
+    """
+    most = 0
+    for path in paths:
+        with contextlib.suppress(FrameError):
+            image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+            if image.dtype != np.uint16:
+                return 0
+            most = max(most, int(image.max()))
+    return min((16 - most.bit_length()) // 2 * 2, 8) if most else 0
 
 
 def read_raw_depth(path: Path) -> NDArray[np.uint16]:

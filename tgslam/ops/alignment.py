@@ -32,6 +32,14 @@ def pack_live(grey: np.ndarray, depth_m: np.ndarray, live: np.ndarray) -> None:
     packing.pack_live(grey, depth_m, live)
 
 
+def mark_saturated(half_cover: np.ndarray, whole: float, live: np.ndarray) -> None:
+    """Let colours of a live image not count where half_cover [H // 2, W // 2] is below `whole`, see `images.mark_rims`.
+
+    half_cover: which share of each pixel is not saturated.
+    """
+    packing.mark_saturated(half_cover, whole, live)
+
+
 def sample_strength(live: np.ndarray, step_px: int, sample: np.ndarray) -> None:
     """Write the texture strength of Eq. 10 at every step-th pixel of a live image into sample [rows, columns]."""
     packing.sample_strength(live, step_px, sample)

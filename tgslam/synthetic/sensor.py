@@ -41,11 +41,14 @@ def noisy_colour(colour: FloatImage, rng: np.random.Generator) -> FloatImage:
     return noisy
 
 
-def noisy_depth(depth_m: FloatImage, cosine: FloatImage, rng: np.random.Generator) -> FloatImage:
+def noisy_depth(
+    depth_m: FloatImage, cosine: FloatImage, rng: np.random.Generator, noise_factor: float = 1.0
+) -> FloatImage:
     """Depth [H, W] m as a structured-light sensor would give it; 0 where it gives none.
 
-    Noise and rounding are in disparity and together have sigma_z = 0.0015 z^2. Edges are displaced by up to a pixel.
-    Holes: part of the pixels at depth edges, grazing surfaces, out of range. cosine [H, W]: |cos| of ray and normal.
+    Noise and rounding are in disparity and together have sigma_z = noise_factor * 0.0015 z^2. Edges are displaced by
+    up to a pixel. Holes: part of the pixels at depth edges, grazing surfaces, out of range. cosine [H, W]: |cos| of ray
+    and normal.
     """
     shape = depth_m.shape
     edge = _depth_edges(depth_m)
@@ -54,10 +57,10 @@ def noisy_depth(depth_m: FloatImage, cosine: FloatImage, rng: np.random.Generato
     kernel = cv2.getGaussianKernel(5, _SMOOTHING_PX).astype(np.float32)
     smooth = cv2.sepFilter2D(white, -1, kernel, kernel) / np.float32((kernel**2).sum())
     total_px = DEPTH_SIGMA_PER_M2 * _FOCAL_BASELINE_PX_M
-    sigma_px = np.float32(np.sqrt(total_px**2 - _DISPARITY_STEP_PX**2 / 12))
+    sigma_px = np.float32(noise_factor * np.sqrt(total_px**2 - _DISPARITY_STEP_PX**2 / 12))
     valid = (depth > 0) & (cosine > _GRAZING_COSINE)
     disparity = np.float32(_FOCAL_BASELINE_PX_M) / np.maximum(depth, np.float32(1e-3)) + sigma_px * smooth
-    step = np.float32(_DISPARITY_STEP_PX)
+    step = np.float32(noise_factor * _DISPARITY_STEP_PX)
     disparity = np.maximum(np.rint(disparity / step), 1) * step
     result = np.float32(_FOCAL_BASELINE_PX_M) / disparity
     valid &= (result >= MIN_RANGE_M) & (result <= MAX_RANGE_M)

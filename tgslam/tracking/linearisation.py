@@ -114,6 +114,6 @@ class Lineariser:
             matched=named[layout.MATCHED],
             inliers=named[layout.INLIERS],
             depth_residual=named[layout.DEPTH_SUM] / matched,
-            colour_residual=named[layout.COLOUR_SUM] / matched * self._config.sigma_colour,
+            colour_residual=named[layout.COLOUR_SUM] / max(named[layout.SHOWN], 1.0) * self._config.sigma_colour,
             intensity=IntensityMoments(*named[layout.W : layout.W_LM + 1]),
         )

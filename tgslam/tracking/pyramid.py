@@ -20,6 +20,7 @@ from tgslam.ops import image as images
 from tgslam.ops.normals import PlaneFits
 from tgslam.ops.rasterize import RenderImages
 from tgslam.tracking.references import NO_PLANES, Reference
+from tgslam.tracking.saturation import WHOLE, half_covers
 from tgslam.types import Frame
 
 # blocks of 2x2 px on each side: a rendered surface has little noise, and wide fits of a measured one round its edges
@@ -69,6 +70,8 @@ class LivePyramid:
         for level, pair, sample in zip(self.levels, self._images.halvings(), self._samples, strict=True):
             alignment.pack_live(pair.grey, pair.depth, level.pixels)
             level.gate_low, level.gate_inverse_range = self._gate_range(level, sample)
+        for level, cover in half_covers(frame.colour, self.levels):
+            alignment.mark_saturated(cover, WHOLE, level.pixels)
         return self.levels
 
     def _gate_range(self, level: LiveLevel, sample: np.ndarray) -> tuple[float, float]:
@@ -131,6 +134,8 @@ class ReferencePyramid:
         images.reduce_frame(colour, depth_m, base.grey, base.depth)
         for level, pair, fits in zip(self.levels, self._images.halvings(), self._fits, strict=True):
             _write_model(level, pair, fits, reference.planes_c)
+        for level, cover in half_covers(colour, self.levels):
+            images.mark_rims(cover, WHOLE, level.surface)
         return self.levels
 
 

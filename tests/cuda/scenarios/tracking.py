@@ -30,6 +30,13 @@ def _view(height: int, width: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return (grey[..., None] * np.array([1.0, 0.9, 0.8])).astype(np.float32), depth_m.astype(np.float32)
 
 
+def _saturated(height: int, width: int) -> Frame:
+    """A view with a corner that is."""
+    colour, depth_m = _view(height, width, seed=0)
+    colour[: height // 2, : width // 3] = 1.0
+    return Frame(0, 0.0, colour, depth_m)
+
+
 def _camera(height: int, width: int) -> Camera:
     return Camera(width, height, 0.9 * width, 0.95 * width, 0.5 * width - 0.3, 0.5 * height - 0.8)
 
@@ -53,7 +60,7 @@ def _rendering(height: int, width: int) -> RenderImages:
 def levels(height: int = 37, width: int = 50, first: int = 1) -> dict[str, np.ndarray]:
     """Everything that alignment reads, at two resolutions."""
     camera = _camera(height, width)
-    live = LivePyramid(camera, first, 2, _LOSS).update(Frame(0, 0.0, *_view(height, width, seed=0)))
+    live = LivePyramid(camera, first, 2, _LOSS).update(_saturated(height, width))
     planes_c = np.array([[*facing, 1.95] for facing in (_slanted(camera), -np.eye(3)[2])])
     model = ModelPyramid(camera, first, 2, _LOSS.noise, _MODEL).update(_rendering(height, width), planes_c)
     result = {}
@@ -69,7 +76,7 @@ def levels(height: int = 37, width: int = 50, first: int = 1) -> dict[str, np.nd
 def normal_equations(height: int = 37, width: int = 50) -> dict[str, np.ndarray]:
     """The equations at a pose and an exposure off the true ones."""
     camera = _camera(height, width)
-    (live,) = LivePyramid(camera, 0, 1, _LOSS).update(Frame(0, 0.0, *_view(height, width, seed=0)))
+    (live,) = LivePyramid(camera, 0, 1, _LOSS).update(_saturated(height, width))
     (model,) = ModelPyramid(camera, 0, 1, _LOSS.noise, _MODEL).update(_rendering(height, width))
     T_ml = se3_exp([0.02, -0.03, 0.015, 0.02, -0.015, 0.03])
     found = Lineariser(camera, ResidualSettings(), _LOSS)(live, model, T_ml, Exposure(1.1, -0.04))
