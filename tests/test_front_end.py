@@ -18,7 +18,7 @@ from tgslam.map.keyframes import Keyframe
 from tgslam.map.world import Map
 from tgslam.tracking.doubt import Doubt, misfit
 from tgslam.tracking.front_end import FrontEnd
-from tgslam.tracking.hypotheses import best, recognised
+from tgslam.tracking.hypotheses import Place, Sighted, recognised
 from tgslam.tracking.result import TrackingResult
 from tgslam.types import Exposure
 
@@ -52,17 +52,14 @@ def at(x_m: float) -> NDArray[np.float64]:
     return se3_exp([0, 0, 0, x_m, 0, 0])
 
 
-# Which place is the right one
+# Whether a pose is the place where a frame was recognised
 
 
-def test_what_is_off_by_less_is_the_place_and_nothing_else_counts() -> None:
-    first, near, off = result(0.0, 1.0), result(0.3, 0.9), result(0.5, 2.0)
-    assert best(first, [off, near]) is near
-    assert best(first, [off]) is first
-    assert best(first, [result(0.3, 0.97)]) is first  # hardly better: a blank wall fits everywhere alike
-    assert best(first, [result(0.3, 0.1, lost=True)]) is first
-    assert best(result(0.0, 0.1, lost=True), [off]) is off
-    assert best(first, []) is first
+def test_a_pose_agrees_within_what_features_may_be_off_by() -> None:
+    place = Place(at(1.0), np.diag([1e6] * 3 + [0.005**-2] * 3))
+    assert place.agrees(at(1.0)) and place.agrees(at(1.01))
+    assert not place.agrees(at(1.05))
+    assert not place.agrees(se3_exp([0.01, 0, 0, 1.0, 0, 0]))
 
 
 def test_depth_that_does_not_match_at_all_is_off_too() -> None:
@@ -104,26 +101,39 @@ def test_predictions_that_were_off_are_remembered_for_a_while() -> None:
 # Where the frame may be
 
 
+def error_m(place: Place | None, number: int) -> float:
+    assert place is not None
+    return float(np.linalg.norm((place.T_cw @ source().pose(number))[:3, 3]))
+
+
 @pytest.mark.parametrize("number", [45, 60])
 def test_a_frame_is_recognised_from_the_latest_keyframe_that_shows_the_same(number: int) -> None:
     world, frame = world_of(300, 30), source().read(number)
-    found = list(recognised(world.looks.of(frame.colour, frame.depth_m), world, anywhere=False))
-    assert len(found) == 1
-    error = found[0] @ source().pose(number)
-    assert np.linalg.norm(error[:3, 3]) < 0.02 and np.linalg.norm(error[:3, :3] - np.eye(3)) < 0.02
+    place = recognised(world.looks.of(frame.colour, frame.depth_m), world, None, anywhere=False)
+    assert error_m(place, number) < 0.02
+    assert place is not None and place.agrees(inverse(source().pose(number)))
+
+
+def test_the_previous_frame_comes_first() -> None:
+    """It shows more of the same than keyframes do; here it is said to have been elsewhere."""
+    world, before, frame = world_of(300, 30), source().read(58), source().read(60)
+    previous = Sighted(world.looks.of(before.colour, before.depth_m), at(5.0) @ inverse(source().pose(58)))
+    place = recognised(world.looks.of(frame.colour, frame.depth_m), world, previous, anywhere=False)
+    assert place is not None
+    expected = inverse(source().pose(60)) @ source().pose(58) @ previous.T_cw
+    assert np.linalg.norm((place.T_cw @ inverse(expected))[:3, 3]) < 0.02
 
 
 def test_a_camera_that_was_carried_is_recognised_anywhere() -> None:
     world, frame = world_of(300, 30, 100, 150, 200), source().read(310)
     look = world.looks.of(frame.colour, frame.depth_m)
-    assert not list(recognised(look, world, anywhere=False))
-    (found,) = recognised(look, world, anywhere=True)
-    assert np.linalg.norm((found @ source().pose(310))[:3, 3]) < 0.02
+    assert recognised(look, world, None, anywhere=False) is None
+    assert error_m(recognised(look, world, None, anywhere=True), 310) < 0.02
 
 
 def test_what_no_keyframe_shows_is_not_recognised() -> None:
     world, frame = world_of(0, 20), source().read(360)
-    assert not list(recognised(world.looks.of(frame.colour, frame.depth_m), world, anywhere=True))
+    assert recognised(world.looks.of(frame.colour, frame.depth_m), world, None, anywhere=True) is None
 
 
 # What the front end does with it
@@ -131,10 +141,11 @@ def test_what_no_keyframe_shows_is_not_recognised() -> None:
 
 @dataclass
 class FakeTracker:
-    """Is lost but within 10 cm of one of `good`, where it goes; remembers what it was asked."""
+    """Goes to where it is drawn from within 30 cm, else it is lost; remembers what it was asked."""
 
-    good: dict[float, float]  # x, and the misfit there
+    drawn_to: list[float]  # x
     asked: list[float] = field(default_factory=list)
+    assessed: list[float] = field(default_factory=list)
     accepted: int = 0
     rasterizer: FakeTracker | None = None
 
@@ -150,42 +161,65 @@ class FakeTracker:
     def track(
         self, frame: object, gaussians: object, T_cw: NDArray[np.float64], exposure: Exposure, prior: object = None
     ) -> TrackingResult:
-        x_m = float((T_cw @ source().pose(0))[0, 3])
-        self.asked.append(round(x_m, 3))
-        near = min(self.good, key=lambda place: abs(place - x_m), default=np.inf)
-        if abs(near - x_m) > 0.1:
+        self.asked.append(round(x_of(T_cw), 2))
+        ends = [x for x in self.drawn_to if abs(x - x_of(T_cw)) < 0.3]
+        if not ends:
             return replace(result(0.0, 3.0, lost=True), T_cw=T_cw)
-        return replace(result(0.0, self.good[near]), T_cw=at(near) @ inverse(source().pose(0)))
+        return replace(result(0.0), T_cw=at(ends[0]) @ inverse(source().pose(0)))
+
+    def assess(self, frame: object, gaussians: object, T_cw: NDArray[np.float64], exposure: Exposure) -> TrackingResult:
+        self.assessed.append(round(x_of(T_cw), 2))
+        return replace(result(0.0), T_cw=T_cw)
 
 
-def tracked(good: dict[float, float], predicted_m: float, latest_m: float = 0.0) -> tuple[TrackingResult, FakeTracker]:
-    """Of frame 0, which a keyframe shows as well, predicted somewhere along x."""
-    front_end, fake = FrontEnd(source().camera, CONFIG.tracking, CONFIG.loss), FakeTracker(good)
+def x_of(T_cw: NDArray[np.float64]) -> float:
+    return float((T_cw @ source().pose(0))[0, 3])
+
+
+def tracked(
+    drawn_to: list[float], predicted_m: float, latest_m: float = 0.0, number: int = 0
+) -> tuple[TrackingResult, FakeTracker]:
+    """Of a frame that is predicted somewhere along x; a keyframe shows frame 0, where x is 0."""
+    front_end, fake = FrontEnd(source().camera, CONFIG.tracking, CONFIG.loss), FakeTracker(drawn_to)
     front_end.tracker = fake  # type: ignore[assignment]
     there = inverse(source().pose(0))
     front_end._motion.update(0.0, at(predicted_m) @ there, 1e12 * np.eye(6))
-    frame = replace(source().read(0), timestamp_s=0.03)
+    frame = replace(source().read(number), timestamp_s=0.03)
     return front_end.track(frame, world_of(300, 0), at(latest_m) @ there), fake
 
 
-def test_another_place_that_looks_the_same_and_fits_better_is_taken() -> None:
-    found, fake = tracked({0.0: 0.5, 1.0: 1.0}, predicted_m=1.0)
-    assert not found.lost and (found.T_cw @ source().pose(0))[0, 3] == pytest.approx(0.0, abs=1e-9)
-    assert len(fake.asked) == 2 and fake.accepted == 1
+def test_a_frame_that_is_recognised_where_it_was_aligned_stays() -> None:
+    found, fake = tracked([0.001], predicted_m=0.1)
+    assert not found.lost and x_of(found.T_cw) == pytest.approx(0.001)
+    assert fake.asked == [0.1] and fake.accepted == 1
 
 
-def test_a_place_that_fits_no_better_is_not() -> None:
-    found, _ = tracked({0.0: 1.0, 1.0: 0.9}, predicted_m=1.0)
-    assert (found.T_cw @ source().pose(0))[0, 3] == pytest.approx(1.0)
+@pytest.mark.parametrize("first", [[1.0], []])
+def test_a_frame_that_is_recognised_elsewhere_is_aligned_there(first: list[float]) -> None:
+    found, fake = tracked([*first, 0.001], predicted_m=1.0)
+    assert not found.lost and x_of(found.T_cw) == pytest.approx(0.001)
+    assert fake.asked == [1.0, 0.0] and fake.accepted == 1
+
+
+def test_where_alignment_leads_away_from_the_place_the_frame_is_there_all_the_same() -> None:
+    found, fake = tracked([1.0, 0.2], predicted_m=1.0)
+    assert not found.lost and x_of(found.T_cw) == pytest.approx(0.0, abs=0.01)
+    assert fake.assessed == [0.0] and fake.accepted == 1
+    assert found.information[3, 3] < 1e6  # what features say, not what alignment would
+
+
+def test_a_frame_that_nothing_is_recognised_in_is_as_aligned() -> None:
+    found, _ = tracked([1.0], predicted_m=1.0, number=540)
+    assert not found.lost and x_of(found.T_cw) == pytest.approx(1.0)
 
 
 def test_fallbacks_are_tried_until_one_holds() -> None:
-    found, fake = tracked({0.5: 1.0}, predicted_m=1.0, latest_m=0.5)
-    assert not found.lost and (found.T_cw @ source().pose(0))[0, 3] == pytest.approx(0.5)
-    assert [fake.asked[0], fake.asked[-1]] == [1.0, 0.5]
+    found, fake = tracked([0.5], predicted_m=1.0, latest_m=0.5, number=540)
+    assert not found.lost and x_of(found.T_cw) == pytest.approx(0.5)
+    assert fake.asked == [1.0, 0.5]
 
 
 def test_where_nothing_holds_the_camera_coasts_with_the_evidence_of_the_first_attempt() -> None:
-    found, fake = tracked({}, predicted_m=1.0, latest_m=0.5)
+    found, fake = tracked([], predicted_m=1.0, latest_m=0.5, number=540)
     assert found.lost and found.message == "lost" and fake.accepted == 0
-    assert (found.T_cw @ source().pose(0))[0, 3] == pytest.approx(1.0)
+    assert x_of(found.T_cw) == pytest.approx(1.0)

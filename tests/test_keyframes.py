@@ -26,10 +26,19 @@ def seen(first: int, stop: int, count: int = 200) -> np.ndarray:
 
 
 @pytest.fixture
-def selector() -> KeyframeSelector:
+def fresh() -> KeyframeSelector:
+    """Frame 5 has just become a keyframe."""
     selector = KeyframeSelector(CONFIG)
     selector.reset(frame(5), HERE, seen(0, 100))
     return selector
+
+
+@pytest.fixture
+def selector(fresh: KeyframeSelector) -> KeyframeSelector:
+    """Two frames later, which were no keyframes."""
+    for _ in range(2):
+        assert fresh.cue(frame(5), HERE, seen(0, 100), unexplained=0.0) == ""
+    return fresh
 
 
 def test_the_same_view_is_no_keyframe(selector: KeyframeSelector) -> None:
@@ -77,10 +86,33 @@ def test_a_new_keyframe_is_what_later_frames_are_compared_with(selector: Keyfram
     assert selector.cue(frame(9), HERE, seen(0, 100, count=300), unexplained=0.0) == "co-visibility: overlap 0.33"
 
 
-def test_asking_changes_nothing(selector: KeyframeSelector) -> None:
+def test_asking_again_changes_nothing(selector: KeyframeSelector) -> None:
     for _ in range(2):
         assert selector.cue(frame(6), HERE, seen(60, 160), unexplained=0.5).startswith("co-visibility: overlap")
         assert selector.cue(frame(30), HERE, seen(0, 100), unexplained=0.0) == "interval"
+
+
+@pytest.mark.parametrize(
+    ("view", "unexplained", "shift_m"),
+    [(seen(0, 65), 0.0, 0.0), (seen(0, 100), 0.3, 0.0), (seen(0, 100), 0.0, 0.5)],
+)
+def test_right_after_a_keyframe_it_takes_more(
+    fresh: KeyframeSelector, view: np.ndarray, unexplained: float, shift_m: float
+) -> None:
+    T_cw = se3_exp([0, 0, 0, 0, shift_m, 0]) @ HERE
+    assert fresh.cue(frame(6), T_cw, view, unexplained) == ""
+    assert fresh.cue(frame(7), T_cw, view, unexplained) == ""
+    assert fresh.cue(frame(8), T_cw, view, unexplained) != ""
+
+
+@pytest.mark.parametrize(
+    ("view", "unexplained", "shift_m"),
+    [(seen(0, 30), 0.0, 0.0), (seen(0, 100), 0.4, 0.0), (seen(0, 100), 0.0, 0.7)],
+)
+def test_but_far_more_is_enough_even_then(
+    fresh: KeyframeSelector, view: np.ndarray, unexplained: float, shift_m: float
+) -> None:
+    assert fresh.cue(frame(6), se3_exp([0, 0, 0, 0, shift_m, 0]) @ HERE, view, unexplained) != ""
 
 
 def test_an_empty_map_does_not_divide_by_zero() -> None:

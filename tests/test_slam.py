@@ -269,6 +269,36 @@ def test_unrelated_frames_are_not_tracked(room: SyntheticSource, room_frames: li
     assert ate_cm(without(played.slam.trajectory(), burst), room) < 0.45
 
 
+def test_a_camera_that_is_carried_is_found_where_it_has_been(room: SyntheticSource) -> None:
+    """First it looks at what it has never seen, then at what it has: nothing is mapped wrongly, and it is found."""
+    there, away, back = range(0, 60, 2), range(400, 410, 2), range(10, 30, 2)
+    frames = [
+        replace(room.read(number), index=k, timestamp_s=k / 30) for k, number in enumerate([*there, *away, *back])
+    ]
+    played = play(room, frames)
+    statuses = played.statuses()
+    assert statuses[: len(there)] == [FrameStatus.INITIAL] + [FrameStatus.TRACKED] * (len(there) - 1)
+    assert statuses[len(there) : len(there) + len(away)] == [FrameStatus.LOST] * len(away)
+    assert statuses[-len(back) :] == [FrameStatus.TRACKED] * len(back)
+    found = played.slam.trajectory().T_wc[-len(back) :]
+    true_T_wc = inverse(room.pose(0)) @ room.groundtruth().T_wc[list(back)]
+    assert np.linalg.norm((found - true_T_wc)[:, :3, 3], axis=1).max() < 0.01
+
+
+@pytest.mark.parametrize("times", ["stretched", "squeezed"])
+def test_a_fast_camera_is_followed_whatever_its_times_say(times: str) -> None:
+    """Every 24th frame: 15 cm and 12 degrees from one to the next, in what is said to be 0.2 s or 8 ms."""
+    source = SyntheticSource(SyntheticConfig(scene="room", frames=720, width=320, height=240), seed=0)
+    step_s = {"stretched": 0.2, "squeezed": 1.0 / 120.0}[times]
+    numbers = range(0, 240, 24)
+    frames = [replace(source.read(number), index=k, timestamp_s=k * step_s) for k, number in enumerate(numbers)]
+    played = play(source, frames)
+    assert played.all_tracked()
+    true_T_wc = inverse(source.pose(0)) @ source.groundtruth().T_wc[list(numbers)]
+    errors_m = np.linalg.norm((played.slam.trajectory().T_wc - true_T_wc)[:, :3, 3], axis=1)
+    assert errors_m.max() < 0.005
+
+
 # Benchmark clips at full resolution, with the packaged configs
 
 

@@ -42,8 +42,3 @@ class Looks:
     def scores(self, look: Look) -> NDArray[np.float64]:
         """[K] how much each keyframe resembles it."""
         return self._retrieval.scores(self._retrieval.words(look.features.descriptors))
-
-    def motion(self, number: int, look: Look) -> NDArray[np.float64] | None:
-        """T_ji [4, 4] from a keyframe to where the look was had; None: they do not show one place beyond doubt."""
-        same = self.verification.compare(self._all[number], look)
-        return None if same is None else same.measured.T_ji

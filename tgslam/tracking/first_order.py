@@ -64,6 +64,12 @@ class FirstOrderTracker:
         with stage(self.stopwatch, "judge"):
             return self._judge.assess(frame, gaussians, T_cw, exposure)
 
+    def assess(
+        self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure
+    ) -> TrackingResult:
+        """See `Tracker.assess`."""
+        return self._judge.assess(frame, gaussians, T_cw, exposure)
+
     def accept(self, result: TrackingResult) -> None:
         """See `Tracker.accept`."""
         self._judge.accept(result)

@@ -15,7 +15,7 @@ from tgslam.map.world import Map
 from tgslam.recognition.verification import Look
 from tgslam.tracking.brightness import KeyframeExposures
 from tgslam.tracking.doubt import Doubt
-from tgslam.tracking.hypotheses import best, recognised
+from tgslam.tracking.hypotheses import Place, Sighted, recognised
 from tgslam.tracking.motion import MotionFilter
 from tgslam.tracking.references import Reference, references_of
 from tgslam.tracking.result import TrackingResult
@@ -36,6 +36,7 @@ class FrontEnd:
         self._doubt = Doubt(camera, coarsest(camera, config))
         self._exposure, self._exposures = Exposure(), KeyframeExposures(camera)
         self._look: Look | None = None  # of the last frame, where it has been looked at
+        self._previous: tuple[Frame, Look | None] | None = None  # the last frame, unless that is lost
 
     def track(self, frame: Frame, world: Map, latest_T_cw: Matrix4) -> TrackingResult:
         """The frame's pose, from where motion leads. Where that is in doubt, places count too where it is recognised;
@@ -47,6 +48,7 @@ class FrontEnd:
         found = first
         if self._doubt.about(first, predicted, median_m):
             found = self._elsewhere(frame, world, first, latest_T_cw)
+        self._previous = None if found.lost else (frame, self._look)
         if found.lost:
             self._doubt.forget()
             return replace(first, T_cw=predicted, exposure=self._exposure)
@@ -57,18 +59,29 @@ class FrontEnd:
         return found
 
     def _elsewhere(self, frame: Frame, world: Map, first: TrackingResult, latest_T_cw: Matrix4) -> TrackingResult:
-        """The best of all places where the frame may be."""
-        self._look = world.looks.of(frame.colour, frame.depth_m)
-        places = recognised(self._look, world, anywhere=first.lost)
-        found = best(first, [self._from(frame, world, T_cw) for T_cw in places])
-        if found.lost:
-            others = [latest_T_cw, *(keyframe.T_cw for keyframe in world.keyframes[: -_FALLBACKS - 1 : -1])]
-            found = next((other for T_cw in others if not (other := self._from(frame, world, T_cw)).lost), first)
-        return found
+        """Where the frame is recognised, or as aligned first if that is the same or it is recognised nowhere."""
+        self._look, previous = world.looks.of(frame.colour, frame.depth_m), None
+        if self._previous is not None:
+            seen, look = self._previous
+            previous = Sighted(look or world.looks.of(seen.colour, seen.depth_m), latest_T_cw)
+        place = recognised(self._look, world, previous, anywhere=first.lost)
+        if place is not None and (first.lost or not place.agrees(first.T_cw)):
+            found = self._at(frame, world, place)
+            if not found.lost:
+                return found
+        if not first.lost:
+            return first
+        others = [latest_T_cw, *(keyframe.T_cw for keyframe in world.keyframes[: -_FALLBACKS - 1 : -1])]
+        results = (self.tracker.track(frame, world.gaussians, T_cw, self._exposure) for T_cw in others)
+        return next((result for result in results if not result.lost), first)
 
-    def _from(self, frame: Frame, world: Map, T_cw: Matrix4) -> TrackingResult:
-        """Aligned from a place to start, T_cw [4, 4]."""
-        return self.tracker.track(frame, world.gaussians, T_cw, self._exposure)
+    def _at(self, frame: Frame, world: Map, place: Place) -> TrackingResult:
+        """Aligned from a place to start. Where that leads away, the map does not show yet what is there: it stays."""
+        found = self.tracker.track(frame, world.gaussians, place.T_cw, self._exposure)
+        if not found.lost and place.agrees(found.T_cw):
+            return found
+        stays = self.tracker.assess(frame, world.gaussians, place.T_cw, self._exposure)
+        return replace(stays, information=place.information)
 
     def tracked_view(self, world: Map) -> NDArray[np.bool_]:
         """[N] Gaussians in view of the last frame, as of the rendering that it was aligned to."""

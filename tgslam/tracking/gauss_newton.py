@@ -107,7 +107,7 @@ class GaussNewtonTracker:
     def assess(
         self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure
     ) -> TrackingResult:
-        """What the frame says of a pose that another solver found; the pose stays as it is."""
+        """See `Tracker.assess`."""
         live = self._live_pyramid.update(frame)
         equations = self._linearise[0](live[0], self._model(gaussians, T_cw)[0], np.eye(4), exposure)
         return self._result(T_cw, np.eye(4), exposure, equations)

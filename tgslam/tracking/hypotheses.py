@@ -1,41 +1,56 @@
-"""Where else a frame may have been taken, and which of the places it was aligned at is the right one."""
+"""Where else a frame may have been taken: the places where it is recognised."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
 
+from tgslam.geometry import inverse, se3_log
 from tgslam.map.world import Map
 from tgslam.recognition.verification import Look
-from tgslam.tracking.doubt import misfit
-from tgslam.tracking.result import TrackingResult
 from tgslam.types import Matrix4
 
 _LATEST = 3  # keyframes that a frame is most likely to share features with
 _ALIKE = 4  # of all keyframes, those that a lost frame resembles most
-_BETTER = 0.95  # times the misfit that another place has to have: places without texture fit alike
+_AGREEMENT = 0.999  # probability with which a right pose agrees with a right place
 
 
-def recognised(look: Look, world: Map, *, anywhere: bool) -> Iterator[Matrix4]:
-    """T_cw [4, 4] by the features that a frame shares with keyframes: with one of the latest, else of those alike.
+class Sighted(NamedTuple):
+    """A frame by its look, and where it was taken."""
 
-    anywhere: all keyframes count, since the camera may have been carried; else only the latest do.
+    look: Look
+    T_cw: Matrix4  # [4, 4]
+
+
+class Place(NamedTuple):
+    """Where a frame was taken by the features that it shares with another view."""
+
+    T_cw: Matrix4  # [4, 4]
+    information: NDArray[np.float64]  # [6, 6] of its left perturbation
+
+    def agrees(self, T_cw: Matrix4) -> bool:
+        """Whether a pose [4, 4] is this one, but for what features may be off by."""
+        error = se3_log(T_cw @ inverse(self.T_cw))
+        return float(error @ self.information @ error) <= float(chi2.ppf(_AGREEMENT, 6))
+
+
+def recognised(look: Look, world: Map, previous: Sighted | None, *, anywhere: bool) -> Place | None:
+    """By features that a frame shares with the previous one, else with one of the latest keyframes or of those alike.
+
+    previous: None where its pose is not known. anywhere: all keyframes count, since the camera may have been carried;
+    else only the latest do.
     """
+    views = [previous] if previous is not None else []
     count = len(world.keyframes)
     latest = range(count - 1, max(count - 1 - _LATEST, -1), -1)
     alike = np.argsort(-world.looks.scores(look), kind="stable")[:_ALIKE].tolist() if anywhere else []
-    for number in dict.fromkeys([*latest, *alike]):
-        T_ji = world.looks.motion(number, look)
-        if T_ji is not None:
-            yield T_ji @ world.keyframes[number].T_cw
-            return
-
-
-def best(first: TrackingResult, others: Sequence[TrackingResult]) -> TrackingResult:
-    """The place that fits best, of those where the frame is not lost; the first one where none fits clearly better."""
-    sound = [other for other in others if not other.lost]
-    if not sound:
-        return first
-    rival = min(sound, key=misfit)
-    return rival if first.lost or misfit(rival) < _BETTER * misfit(first) else first
+    views += [Sighted(world.looks[k], world.keyframes[k].T_cw) for k in dict.fromkeys([*latest, *alike])]
+    for view in views:
+        same = world.looks.verification.compare(view.look, look)
+        if same is not None:
+            motion = same.measured.motion
+            return Place(motion.T_ji @ view.T_cw, motion.information)
+    return None

@@ -50,6 +50,12 @@ class Tracker(Protocol):
         """
         ...
 
+    def assess(
+        self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure
+    ) -> TrackingResult:
+        """What the frame says of a pose that was found otherwise; the pose stays as it is."""
+        ...
+
     def accept(self, result: TrackingResult) -> None:
         """It is what a frame has been tracked to: what it measured becomes usual."""
         ...
