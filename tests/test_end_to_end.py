@@ -77,7 +77,7 @@ def test_render_draws_the_map(runs: Path) -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGTERM handlers there")
 def test_a_terminated_run_leaves_a_readable_run(tmp_path: Path) -> None:
-    process = start(tmp_path, "run", *SMALL, "--output", "cut")
+    process = start(tmp_path, "run", "fast", *SMALL, "--output", "cut")
     log = tmp_path / "cut" / "log.jsonl"
     deadline_s = time.monotonic() + TIMEOUT_S
     while not (log.exists() and log.read_text().count("\n") >= 2):

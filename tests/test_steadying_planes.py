@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tgslam.camera import Camera, SensorNoise
+from tgslam.config.graph_settings import LoopConfig
 from tgslam.config.plane_settings import PlanesConfig
 from tgslam.geometry import se3_exp
 from tgslam.map.keyframes import Keyframe
@@ -32,7 +33,7 @@ def depth_of(*planes_c: tuple[float, float, float, float]) -> np.ndarray:
 def seen(depth_m: np.ndarray) -> Map:
     """A map with the planes of its first keyframe, which stands somewhere in the world."""
     colour, config = np.full((*depth_m.shape, 3), 0.5, np.float32), PlanesConfig(enabled=True)
-    world = Map(CAMERA, SensorNoise(SIGMA_PER_M2), config)
+    world = Map(CAMERA, SensorNoise(SIGMA_PER_M2), LoopConfig(), config)
     world.keyframes.add(Keyframe(Frame(0, 0.0, colour, depth_m), T_CW, Exposure(), np.eye(6)))
     PlaneObserver(CAMERA, config, world.noise).observe(world)
     return world

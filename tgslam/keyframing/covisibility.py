@@ -48,15 +48,8 @@ class KeyframeSelector:
         if unexplained > much * self.config.max_unexplained:
             return f"co-visibility: {unexplained:.0%} of the frame is not in the map"
         moved_m = float(np.linalg.norm(inverse(T_cw)[:3, 3] - inverse(self._T_cw)[:3, 3]))
-        if moved_m > much * self.config.max_translation * _median_depth_m(frame):
+        if moved_m > much * self.config.max_translation * images.median_of_measured(runtime.to_device(frame.depth_m)):
             return f"baseline: {moved_m:.2f} m"
         if frame.index - self._last_index >= self.config.max_interval:
             return "interval"
         return ""
-
-
-def _median_depth_m(frame: Frame) -> float:
-    """Of a grid of the frame's measurements; infinite where it meets none."""
-    depth_m = images.sampled(runtime.to_device(frame.depth_m))
-    measured = depth_m[depth_m > 0]
-    return float(np.median(measured)) if len(measured) else np.inf

@@ -137,6 +137,13 @@ def sampled(image: np.ndarray) -> NDArray[np.float32]:
     return runtime.to_host(sample)
 
 
+def median_of_measured(depth_m: np.ndarray) -> float:
+    """Of a grid of what is measured in [H, W] m, 0 = none, on the device; infinite where nothing is."""
+    sample = sampled(depth_m)
+    measured = sample[sample > 0]
+    return float(np.median(measured)) if len(measured) else np.inf
+
+
 def _percentile(ordered: NDArray[np.float32], percentile: float) -> float:
     """As `np.percentile`, of values in ascending order: several then need one sort."""
     rank = percentile / 100.0 * (ordered.size - 1)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from tgslam.camera import Camera, SensorNoise
 from tgslam.config.graph_settings import LoopConfig
+from tgslam.device import runtime
 from tgslam.recognition.depth_agreement import DepthGrid
 from tgslam.recognition.features import Detector
 from tgslam.recognition.retrieval import Retrieval
@@ -31,7 +32,8 @@ class Looks:
         return self._all[number]
 
     def of(self, colour: FloatImage, depth_m: FloatImage) -> Look:
-        """Of an image: colour [H, W, 3] in [0, 1], depth [H, W] m, 0 = none."""
+        """Of an image, on the host or on the device: colour [H, W, 3] in [0, 1], depth [H, W] m, 0 = none."""
+        colour, depth_m = runtime.to_host(colour), runtime.to_host(depth_m)
         return Look(self._detector.detect(colour, depth_m), DepthGrid.of(depth_m, self._camera))
 
     def add(self, look: Look) -> None:

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from tgslam.camera import Camera
 from tgslam.config.map_settings import LossConfig
 from tgslam.config.tracking_settings import TrackingConfig
+from tgslam.device import runtime
 from tgslam.map.keyframes import Keyframe
 from tgslam.map.world import Map
+from tgslam.ops import image as images
 from tgslam.recognition.verification import Look
 from tgslam.tracking.brightness import KeyframeExposures
 from tgslam.tracking.doubt import Doubt
@@ -36,7 +38,7 @@ class FrontEnd:
         self._doubt = Doubt(camera, coarsest(camera, config))
         self._exposure, self._exposures = Exposure(), KeyframeExposures(camera)
         self._look: Look | None = None  # of the last frame, where it has been looked at
-        self._previous: tuple[Frame, Look | None] | None = None  # the last frame, unless that is lost
+        self._previous: Look | tuple[FloatImage, FloatImage] | None = None  # the last frame, unless that is lost
 
     def track(self, frame: Frame, world: Map, latest_T_cw: Matrix4) -> TrackingResult:
         """The frame's pose, from where motion leads. Where that is in doubt, places count too where it is recognised;
@@ -44,11 +46,11 @@ class FrontEnd:
         """
         predicted, prior = self._motion.predict(frame.timestamp_s), self._motion.information(frame.timestamp_s)
         first = self.tracker.track(frame, world.gaussians, predicted, self._exposure, prior)
-        self._look, median_m = None, _median(frame.depth_m)
+        self._look, median_m = None, images.median_of_measured(runtime.to_device(frame.depth_m))
         found = first
         if self._doubt.about(first, predicted, median_m):
             found = self._elsewhere(frame, world, first, latest_T_cw)
-        self._previous = None if found.lost else (frame, self._look)
+        self._previous = None if found.lost else self._look or _copied(frame)
         if found.lost:
             self._doubt.forget()
             return replace(first, T_cw=predicted, exposure=self._exposure)
@@ -62,8 +64,8 @@ class FrontEnd:
         """Where the frame is recognised, or as aligned first if that is the same or it is recognised nowhere."""
         self._look, previous = world.looks.of(frame.colour, frame.depth_m), None
         if self._previous is not None:
-            seen, look = self._previous
-            previous = Sighted(look or world.looks.of(seen.colour, seen.depth_m), latest_T_cw)
+            look = self._previous if isinstance(self._previous, Look) else world.looks.of(*self._previous)
+            previous = Sighted(look, latest_T_cw)
         place = recognised(self._look, world, previous, anywhere=first.lost)
         if place is not None and (first.lost or not place.agrees(first.T_cw)):
             found = self._at(frame, world, place)
@@ -134,3 +136,8 @@ class FrontEnd:
 def _median(depth_m: FloatImage) -> float:
     """Of what is measured of [H, W] m, 0 = none."""
     return float(np.median(depth_m[depth_m > 0])) if depth_m.any() else 0.0
+
+
+def _copied(frame: Frame) -> tuple[FloatImage, FloatImage]:
+    """Its images on the host; callers may write the next ones over them."""
+    return runtime.to_host(frame.colour).copy(), runtime.to_host(frame.depth_m).copy()
