@@ -12,13 +12,19 @@ from tools.cudacheck.environment import Grid
 
 pytestmark = pytest.mark.cuda_check
 
-# All kernels of the others take part where there are planes
-CASES = [("relaxation", True, grid) for grid in GRIDS]
-CASES += [("relaxation", False, Grid.DEFAULT), ("adam", False, Grid.DEFAULT)]
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_the_map_and_the_pose_move_alike(devices: Devices, grid: Grid) -> None:
+    """With planes: then the kernels of the others take part as well."""
+    _compare(devices, grid, "relaxation", planes=True)
 
 
-@pytest.mark.parametrize(("optimizer", "planes", "grid"), CASES)
-def test_the_map_and_the_pose_move_alike(devices: Devices, grid: Grid, optimizer: str, planes: bool) -> None:
+@pytest.mark.parametrize("optimizer", ["relaxation", "adam"])
+def test_they_do_without_planes(devices: Devices, optimizer: str) -> None:
+    _compare(devices, Grid.DEFAULT, optimizer, planes=False)
+
+
+def _compare(devices: Devices, grid: Grid, optimizer: str, *, planes: bool) -> None:
     cpu, cuda = devices.both(refinement.steps, grid, optimizer=optimizer, planes=planes)
     np.testing.assert_array_equal(cuda["views"], cpu["views"])
     assert 0.5 < (cpu["views"] == 3).mean() < 0.95
