@@ -39,7 +39,7 @@ class Planes:
     def __init__(self) -> None:
         self.views: dict[int, dict] = {}
         self.renamed: dict[int, int] = {}
-        self.split: set[int] = set()
+        self.revision = 0
         self.asked_m: set[float] = set()  # by how much surfaces were taken to stray from planes
 
     def resolve(self, plane_id: int) -> int:
@@ -61,7 +61,8 @@ class Planes:
             i: SimpleNamespace(
                 keyframes=[k for k in self.views if i in self.seen_from(k)],
                 view=lambda k, surface_sigma_m, i=i: self.seen_from(k, surface_sigma_m).get(i),
-                split_from=self if i in self.split else None,
+                views=lambda sigma_m, i=i: {k: s[i] for k in self.views if i in (s := self.seen_from(k, sigma_m))},
+                lineage=SimpleNamespace(revision=self.revision),
             )
             for i in ids
         }
@@ -169,6 +170,7 @@ def test_planes_that_merge_are_one_landmark_from_then_on() -> None:
     for _ in range(25):
         walk.add(closing)
     walk.planes.renamed[77] = first
+    walk.planes.revision += 1
     for _ in range(15):
         walk.add(closing)
     assert walk.error_m() < 0.7 * walked(changed(CONFIG, formulation="closures", interval=1000), 3).error_m()

@@ -18,7 +18,7 @@ from tests.tiers import changed
 from tgslam.config.graph_settings import ClosureConfig, SolvingSettings
 from tgslam.errors import GraphError
 from tgslam.geometry import inverse, se3_exp, se3_log
-from tgslam.graph.factors import PlaneError
+from tgslam.graph.factors import PlaneError, Sighting, whitening
 from tgslam.graph.gating import passes
 from tgslam.graph.pose_graph import GraphEstimate, PoseGraph
 from tgslam.graph.relative import measure
@@ -56,6 +56,12 @@ class Corruption:
         return replace(measured, T_ji=se3_exp(xi) @ measured.T_ji)
 
 
+def replace_planes(graph: PoseGraph, views: list[dict[int, PlaneEstimate]]) -> None:
+    """All sightings anew, by keyframe and plane."""
+    for plane_id in sorted({*graph.estimate().plane_ids.tolist(), *(i for seen in views for i in seen)}):
+        graph.replace_plane(plane_id, {k: seen[plane_id] for k, seen in enumerate(views) if plane_id in seen})
+
+
 World = tuple[list[np.ndarray], list[RelativePose], list[dict[int, PlaneEstimate]]]
 
 
@@ -82,8 +88,7 @@ def run(
         else:
             graph.add_keyframe(k, {k - 1: motions[k - 1]})
         if config.formulation != "closures":
-            for plane_id, plane in seen.items():
-                graph.add_plane_observation(k, plane_id, plane)
+            graph.add_plane_observations([Sighting(k, plane_id, plane) for plane_id, plane in seen.items()])
         estimate = graph.optimise()
         if config.formulation != "landmarks" and k and k % config.interval == 0:
             T_ji = dict(enumerate(estimate.T_cw[k] @ inverse(estimate.T_cw[:k])))
@@ -117,7 +122,7 @@ def test_the_error_of_a_plane_is_in_standard_deviations_and_its_jacobians_are_ri
     rng = np.random.default_rng(seed)
     T_cw, plane_w = random_pose(rng), random_plane(rng)
     seen = shifted(plane_w.transformed(T_cw), 1e-2 * rng.standard_normal(3))
-    error = PlaneError((0, 1), seen)
+    error = PlaneError((0, 1), seen, whitening(seen.covariance))
     pose, landmark = gtsam.Pose3(inverse(T_cw)), gtsam.OrientedPlane3(*plane_w.normal, float(plane_w.offset_m))
 
     def at(xi: np.ndarray, turn: np.ndarray, jacobians: list[np.ndarray] | None = None) -> np.ndarray:
@@ -143,7 +148,7 @@ def test_a_plane_that_is_off_by_its_own_errors_has_their_mahalanobis_length(seed
     values = gtsam.Values()
     values.insert(0, gtsam.Pose3(inverse(T_cw)))
     values.insert(1, gtsam.OrientedPlane3(*predicted.normal, float(predicted.offset_m)))
-    found = PlaneError((0, 1), local)(None, values, None)
+    found = PlaneError((0, 1), local, whitening(local.covariance))(None, values, None)
     expected = offset @ np.linalg.solve(local.covariance, offset)
     assert_allclose(found @ found, expected, rtol=0.1)
 
@@ -199,8 +204,7 @@ def test_solvers_agree(solver: str) -> None:
     graph = PoseGraph(SolvingSettings(graph_solver=solver, relinearise=1e-4))
     chain(graph, truth[0], motions)
     for k, seen in enumerate(views):
-        for plane_id, plane in seen.items():
-            graph.add_plane_observation(k, plane_id, plane)
+        graph.add_plane_observations([Sighting(k, plane_id, plane) for plane_id, plane in seen.items()])
     found = graph.optimise()
     assert rms_m(found, truth) < 0.02
     reference = run(changed(LANDMARKS, relinearise=1e-4), truth, motions, views)
@@ -292,17 +296,16 @@ def test_planes_that_merge_and_end(solver: str) -> None:
     graph = PoseGraph(SolvingSettings(graph_solver=solver))
     chain(graph, truth[0], motions)
     for k, seen in enumerate(views):
-        for plane_id, plane in seen.items():
-            graph.add_plane_observation(k, plane_id + (10 if k > 15 else 0), plane)
-    graph.add_plane_observation(3, 99, random_plane(np.random.default_rng(0)))
+        graph.add_plane_observations([Sighting(k, i + (10 if k > 15 else 0), plane) for i, plane in seen.items()])
+    graph.add_plane_observations([Sighting(3, 99, random_plane(np.random.default_rng(0)))])
     graph.optimise()
-    graph.replace_planes(dict(enumerate(views)))
+    replace_planes(graph, views)
     found, reference = graph.optimise(), run(LANDMARKS, truth, motions, views)
     assert found.plane_ids.tolist() == list(range(6))
     assert_allclose(found.T_cw, reference.T_cw, atol=1e-2)
-    graph.replace_planes({k: {p: plane for p, plane in seen.items() if p != 5} for k, seen in enumerate(views)})
+    replace_planes(graph, [{p: plane for p, plane in seen.items() if p != 5} for seen in views])
     assert 5 not in graph.optimise().plane_ids
-    graph.replace_planes({})
+    replace_planes(graph, [])
     assert len(graph.optimise().planes) == 0
 
 
@@ -357,7 +360,8 @@ def test_what_cannot_be_used_is_refused_with_a_message() -> None:
     with pytest.raises(GraphError, match="keyframe 5"):
         graph.add_closure(0, 5, motion)
     with pytest.raises(GraphError, match="covariance"):
-        graph.add_plane_observation(0, 0, replace(random_plane(np.random.default_rng(0)), covariance=np.zeros((3, 3))))
+        unsound = replace(random_plane(np.random.default_rng(0)), covariance=np.zeros((3, 3)))
+        graph.add_plane_observations([Sighting(0, 0, unsound)])
     graph.optimise()
     graph.add_keyframe(2, {1: motion})
     with pytest.raises(GraphError, match="0 and 2"):

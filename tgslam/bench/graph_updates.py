@@ -65,6 +65,7 @@ def measure(sizes: list[Size], step: Callable[[str], None]) -> list[dict[str, An
 
 def _measure_here(size: Size) -> dict[str, Any]:
     """Updates of a growing graph under the default settings; the estimate is read after each."""
+    from tgslam.graph.factors import Sighting
     from tgslam.graph.pose_graph import PoseGraph
 
     config = ClosureConfig().expert
@@ -76,8 +77,7 @@ def _measure_here(size: Size) -> dict[str, Any]:
         else:
             motion = added.motion.widened(config.evidence.odometry_sigma_rad, config.evidence.odometry_sigma_m)
             graph.add_keyframe(k, {k - 1: motion})
-        for plane_id, plane in added.seen.items():
-            graph.add_plane_observation(k, plane_id, plane)
+        graph.add_plane_observations([Sighting(k, plane_id, plane) for plane_id, plane in added.seen.items()])
         estimate = graph.optimise()
         times_s.append((time.perf_counter() - start[0], time.process_time() - start[1]))
     update_ms, cpu_ms = 1e3 * np.array(times_s).T

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from tgslam.camera import Camera, SensorNoise
 from tgslam.config.graph_settings import ClosureConfig, LoopConfig
-from tgslam.geometry import inverse
+from tgslam.geometry import inverse, orthonormalized
+from tgslam.graph.factors import Sighting
 from tgslam.graph.findings import Closure
 from tgslam.graph.pose_graph import PoseGraph
 from tgslam.graph.structure.icp import View
@@ -47,7 +48,7 @@ class GraphClosing:
         self._search = ClosureSearch(camera, noise, config) if by_planes else None
         self._loops = LoopSearch(loops) if loops.enabled else None
         self._followed: list[NDArray[np.float64]] = []  # T_cw by the graph's estimate when the map last followed it
-        self._sighted: dict[int, set[int]] = {}  # PGI -> keyframes whose sightings are in the graph
+        self._sighted: dict[int, tuple[int, int]] = {}  # PGI -> its revision and its latest keyframe in the graph
         self._untied: list[tuple[int, int]] = []  # keyframes between which closures have moved nothing yet
 
     @property
@@ -90,30 +91,30 @@ class GraphClosing:
         if latest == 0:
             self._graph.add_first(0, T_cw)
             return
-        sigmas, information = self._config.expert.evidence, keyframe.information
-        odometry = {}
-        for earlier, share in owners.items():
-            motion = RelativePose(T_cw @ inverse(self._followed[earlier]), information)
-            motion = motion.widened(sigmas.odometry_sigma_rad, sigmas.odometry_sigma_m)
-            odometry[earlier] = RelativePose(motion.T_ji, share * motion.information)
+        sigmas = self._config.expert.evidence
+        widened = RelativePose(T_cw, keyframe.information).widened(sigmas.odometry_sigma_rad, sigmas.odometry_sigma_m)
+        odometry = {
+            earlier: RelativePose(orthonormalized(T_cw @ inverse(self._followed[earlier])), share * widened.information)
+            for earlier, share in owners.items()
+        }
         self._graph.add_keyframe(latest, odometry)
 
     def _add_sightings(self, planes: PlaneRegistry) -> None:
-        """What is new; everything anew where PGIs have merged, split or ended."""
+        """What is new; of PGIs that have merged or split, whatever has changed."""
         instances, surface_m = planes.instances, self._config.expert.evidence.view_sigma_m
-        gone = self._sighted.keys() - instances.keys()
-        split = any(i.split_from is not None for k, i in instances.items() if k not in self._sighted)
-        if gone or split:
-            self._sighted = {plane_id: set(instance.keyframes) for plane_id, instance in instances.items()}
-            self._graph.replace_planes({k: planes.seen_from(k, surface_m) for k in range(len(self._followed))})
-            return
+        for plane_id in self._sighted.keys() - instances.keys():
+            self._graph.replace_plane(plane_id, {})
+            del self._sighted[plane_id]
+        news = []
         for plane_id, instance in instances.items():
-            known = self._sighted.setdefault(plane_id, set())
-            for keyframe in instance.keyframes:
-                view = None if keyframe in known else instance.view(keyframe, surface_m)
-                if view is not None:
-                    self._graph.add_plane_observation(keyframe, plane_id, view)
-            known.update(instance.keyframes)
+            revision, latest = self._sighted.get(plane_id, (-1, -1))
+            if revision != instance.lineage.revision:
+                self._graph.replace_plane(plane_id, instance.views(surface_m))
+            elif latest < instance.keyframes[-1]:
+                view = instance.view(instance.keyframes[-1], surface_m)
+                news += [] if view is None else [Sighting(instance.keyframes[-1], plane_id, view)]
+            self._sighted[plane_id] = instance.lineage.revision, instance.keyframes[-1]
+        self._graph.add_plane_observations(news)
 
     def _structure_closures(self, world: Map, T_cw: NDArray[np.float64]) -> tuple[Closure, ...]:
         """Of the latest keyframe with earlier ones that see the same planes."""

@@ -7,6 +7,7 @@ speak of left perturbations of T_cw and T_ji in the order (rotation, translation
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +25,8 @@ Vector = NDArray[np.float64]
 
 _FIXED = 1e-6  # rad and m, of the first keyframe: it holds the graph
 _LOOSE = np.diag([10.0**-2] * 3 + [1000.0**-2] * 3)  # rad, m: odometry that says nothing leaves the graph regular
-_TURNS = np.stack([hat(axis) for axis in np.eye(3)])  # [3, 3, 3] generators of rotations
+_IDENTITY = np.eye(3)
+_TURNS = np.stack([hat(axis) for axis in _IDENTITY])  # [3, 3, 3] generators of rotations
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,7 @@ class FactorMaker:
 
     def __init__(self, config: SolvingSettings) -> None:
         self._config = config
+        self._plane_noise = self._robust(gtsam.noiseModel.Unit.Create(3))
 
     def edge(self, edge: Edge) -> gtsam.BetweenFactorPose3:
         """Of a motion."""
@@ -92,15 +95,19 @@ class FactorMaker:
             self._robust(noise) if edge.robust else noise,
         )
 
-    def plane(self, sighting: Sighting) -> gtsam.CustomFactor:
-        """Of a plane. Raises GraphError without a sound covariance."""
-        keys = pose_key(sighting.keyframe), plane_key(sighting.plane_id)
+    def planes(self, sightings: Sequence[Sighting]) -> list[gtsam.CustomFactor]:
+        """Of seen planes. Raises GraphError for one without a sound covariance."""
         try:
-            error = PlaneError(keys, sighting.plane)
+            whites = whitening(np.array([s.plane.covariance for s in sightings]).reshape(-1, 3, 3))
         except np.linalg.LinAlgError as bad:
-            name = f"plane {sighting.plane_id} as keyframe {sighting.keyframe} saw it"
+            unsound = next(s for s in sightings if not _sound(s.plane.covariance))
+            name = f"plane {unsound.plane_id} as keyframe {unsound.keyframe} saw it"
             raise GraphError(f"{name} has no sound covariance") from bad
-        return gtsam.CustomFactor(self._robust(gtsam.noiseModel.Unit.Create(3)), list(keys), error)
+        return [self._plane(sighting, white) for sighting, white in zip(sightings, whites, strict=True)]
+
+    def _plane(self, sighting: Sighting, white: Vector) -> gtsam.CustomFactor:
+        keys = pose_key(sighting.keyframe), plane_key(sighting.plane_id)
+        return gtsam.CustomFactor(self._plane_noise, list(keys), PlaneError(keys, sighting.plane, white))
 
     def _robust(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
         scale = self._config.robust_sigmas
@@ -125,19 +132,16 @@ class PlaneError:
     Nor does it take robust noise models.
     """
 
-    def __init__(self, keys: tuple[int, int], plane: PlaneEstimate) -> None:
-        """keys: gtsam's, of the keyframe and of the plane. Raises LinAlgError without a sound covariance."""
+    def __init__(self, keys: tuple[int, int], plane: PlaneEstimate, white: Vector) -> None:
+        """keys: gtsam's, of the keyframe and of the plane. white: of `whitening` of the plane's covariance."""
         self._keys = keys
         first, second = plane.axes
-        white = np.linalg.inv(np.linalg.cholesky(plane.covariance))
-        if not np.isfinite(white).all():
-            raise np.linalg.LinAlgError
         self._by_plane = np.empty((3, 4))  # of (n, d) in the camera's frame
         np.matmul(white, np.array([-second, first, -plane.centroid]), out=self._by_plane[:, :3])
         np.negative(white[:, 2], out=self._by_plane[:, 3])
         by_pose = np.empty((3, 3, 6))  # what each component of n adds to the jacobian
         by_pose[:, :, :3] = self._by_plane[:, :3] @ _TURNS
-        by_pose[:, :, 3:] = self._by_plane[:, 3, None] * np.eye(3)[:, None]
+        by_pose[:, :, 3:] = self._by_plane[:, 3, None] * _IDENTITY[:, None]
         self._by_pose = by_pose.reshape(3, 18)
 
     def __call__(
@@ -155,6 +159,22 @@ class PlaneError:
             jacobians[1] = of_plane
         error: Vector = by_normal_w @ coefficients[:3] + by_offset * coefficients[3]
         return error
+
+
+def whitening(covariance: Vector) -> Vector:
+    """[..., 3, 3] what turns errors of such covariances into standard deviations. Raises LinAlgError where unsound."""
+    white: Vector = np.linalg.inv(np.linalg.cholesky(covariance))
+    if not np.isfinite(white).all():
+        raise np.linalg.LinAlgError
+    return white
+
+
+def _sound(covariance: Vector) -> bool:
+    try:
+        whitening(covariance)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def _root(information: NDArray[np.floating[Any]]) -> Vector:

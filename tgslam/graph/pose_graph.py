@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,7 @@ from tgslam.config.graph_settings import SolvingSettings
 from tgslam.errors import GraphError
 from tgslam.geometry import adjoint, inverse
 from tgslam.graph.factors import Edge, FactorMaker, Sighting, anchor_factor, plane_key, pose_key
-from tgslam.graph.solvers import Batch, make_solver
+from tgslam.graph.solvers import Batch, Change, make_solver
 from tgslam.planes.estimate import PlaneEstimate
 from tgslam.types import RelativePose
 
@@ -38,15 +38,16 @@ class PoseGraph:
     """
 
     def __init__(self, config: SolvingSettings) -> None:
-        self._config, self._factors = config, FactorMaker(config)
+        self._config, self._maker = config, FactorMaker(config)
         self._keyframes: list[int] = []
         self._edges: list[Edge] = []
-        self._sightings: list[Sighting] = []
-        self._plane_ids: set[int] = set()  # of the sightings
+        self._sightings: dict[int, dict[int, PlaneEstimate]] = {}  # by plane, then by keyframe
         self._origin: tuple[int, Vector] | None = None
+        self._factors: dict[
+            Hashable, gtsam.NonlinearFactor
+        ] = {}  # all; of sightings by (keyframe, plane), of edges by number
         self._values = gtsam.Values()  # the latest estimate, with a first guess of what is new
-        self._fresh_factors = gtsam.NonlinearFactorGraph()
-        self._fresh_values = gtsam.Values()
+        self._change = Change()  # that the solver has not been told yet
         self._solver = make_solver(config)
 
     @property
@@ -59,7 +60,7 @@ class PoseGraph:
         if self._origin is not None:
             raise GraphError(f"keyframe {keyframe} is not the first one: that is keyframe {self._origin[0]}")
         self._origin = (keyframe, T_cw)
-        self._fresh_factors.push_back(anchor_factor(keyframe, T_cw))
+        self._add(anchor_factor(keyframe, T_cw), None)
         self._insert(pose_key(keyframe), gtsam.Pose3(inverse(T_cw)))
         self._keyframes.append(keyframe)
 
@@ -77,7 +78,7 @@ class PoseGraph:
         self._insert(pose_key(keyframe), starts[0].compose(gtsam.Pose3(inverse(edges[0].motion.T_ji))))
         self._keyframes.append(keyframe)
         for edge in edges:
-            self._add(edge)
+            self._add_edge(edge)
 
     def add_closure(self, i: int, j: int, motion: RelativePose, *, robust: bool = True) -> None:
         """A motion from keyframe i to j measured otherwise; its information may be singular.
@@ -89,46 +90,47 @@ class PoseGraph:
             self._pose_of(keyframe)
         edge = Edge(i, j, motion, closure=True, robust=robust)
         edge.check()
-        self._add(edge)
+        self._add_edge(edge)
 
-    def add_plane_observation(self, keyframe: int, plane_id: int, plane: PlaneEstimate) -> None:
-        """A keyframe sees a plane; `plane` is that view's own, in its camera's frame.
+    def add_plane_observations(self, sightings: Sequence[Sighting]) -> None:
+        """Keyframes see planes: each sighting is that view's own, in its camera's frame.
 
-        Raises GraphError for an unknown keyframe, or for a plane without a sound covariance.
+        One of a plane that the keyframe has seen already takes the place of the other. Raises GraphError for an unknown
+        keyframe, or for a plane without a sound covariance.
         """
-        pose, key = self._pose_of(keyframe), plane_key(plane_id)
-        sighting = Sighting(keyframe, plane_id, plane)
-        self._fresh_factors.push_back(self._factors.plane(sighting))
-        self._sightings.append(sighting)
-        self._plane_ids.add(plane_id)
-        if not self._values.exists(key):
-            world = plane.transformed(pose.matrix())
-            self._insert(key, gtsam.OrientedPlane3(np.append(world.normal, world.offset_m)))
+        poses = {keyframe: self._pose_of(keyframe) for keyframe in {sighting.keyframe for sighting in sightings}}
+        for sighting, factor in zip(sightings, self._maker.planes(sightings), strict=True):
+            self._forget(sighting.keyframe, sighting.plane_id)
+            self._sightings.setdefault(sighting.plane_id, {})[sighting.keyframe] = sighting.plane
+            self._add(factor, (sighting.keyframe, sighting.plane_id))
+            key = plane_key(sighting.plane_id)
+            if not self._values.exists(key):
+                world = sighting.plane.transformed(poses[sighting.keyframe].matrix())
+                self._insert(key, gtsam.OrientedPlane3(np.append(world.normal, world.offset_m)))
 
-    def replace_planes(self, sightings: Mapping[int, Mapping[int, PlaneEstimate]]) -> None:
-        """All sightings anew, by keyframe and plane: for when planes have merged, split or ended.
+    def replace_plane(self, plane_id: int, views: Mapping[int, PlaneEstimate]) -> None:
+        """All sightings of a plane anew, by keyframe, for when it has merged or split: without any, it ends.
 
-        Planes that stay begin where they are, new ones where they are first seen. Costs as much as a first `optimise`
-        of everything.
+        It begins where it is, a new one where it is first seen. Sightings that stay as they were cost nothing.
         """
-        kept = {plane_id for seen in sightings.values() for plane_id in seen}
-        for plane_id in self._plane_ids - kept:
-            self._values.erase(plane_key(plane_id))
-        self._sightings, self._plane_ids = [], set()
-        for keyframe, seen in sightings.items():
-            for plane_id, plane in seen.items():
-                self.add_plane_observation(keyframe, plane_id, plane)
-        self._rebuild()
+        known = self._sightings.get(plane_id, {})
+        same = {keyframe for keyframe, plane in views.items() if keyframe in known and _equal(known[keyframe], plane)}
+        for keyframe in known.keys() - same:
+            self._forget(keyframe, plane_id)
+        if not views and self._sightings.pop(plane_id, None) is not None:
+            for values in (self._values, self._change.values):
+                if values.exists(plane_key(plane_id)):
+                    values.erase(plane_key(plane_id))
+        self.add_plane_observations([Sighting(k, plane_id, plane) for k, plane in views.items() if k not in same])
 
     def optimise(self) -> GraphEstimate:
         """Take in what was added and solve.
 
         Raises GraphError when there is no solution; what was added since the last one is in the graph all the same.
         """
-        factors, values = self._fresh_factors, self._fresh_values
-        self._fresh_factors, self._fresh_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        change, self._change = self._change, Change()
         try:
-            self._values = self._solver.update(factors, values)
+            self._values = self._solver.update(change)
         except RuntimeError:  # gtsam's, of a singular system: damping from the last estimate may get past it
             self._restart()
         return self.estimate()
@@ -142,7 +144,7 @@ class PoseGraph:
         T_wc[:, :3, :3], T_wc[:, :3, 3] = flat[:, :9].reshape(-1, 3, 3), flat[:, 9:]
         keyframes, T_cw = np.array(sorted(self._keyframes), np.int64), inverse(T_wc)
         T_cw[keyframes == self._origin[0]] = self._origin[1]  # to the last bit
-        plane_ids = sorted(self._plane_ids)
+        plane_ids = sorted(self._sightings)
         planes = [self._values.atOrientedPlane3(plane_key(plane)).planeCoefficients() for plane in plane_ids]
         return GraphEstimate(
             keyframes,
@@ -173,38 +175,41 @@ class PoseGraph:
         return self._values.atPose3(pose_key(keyframe))
 
     def _insert(self, key: int, value: Any) -> None:
-        for values in (self._values, self._fresh_values):
+        for values in (self._values, self._change.values):
             values.insert(key, value)
 
-    def _add(self, edge: Edge) -> None:
+    def _add_edge(self, edge: Edge) -> None:
         self._edges.append(edge)
-        self._fresh_factors.push_back(self._factors.edge(edge))
+        self._add(self._maker.edge(edge), len(self._edges))
 
-    def _rebuild(self) -> None:
-        """A new solver that is to start from the present values with all there is."""
-        self._solver = make_solver(self._config)
-        self._fresh_factors, self._fresh_values = self._all_factors(), gtsam.Values(self._values)
+    def _add(self, factor: gtsam.NonlinearFactor, name: Hashable) -> None:
+        self._factors[name] = factor
+        self._change.add(name, factor)
+
+    def _forget(self, keyframe: int, plane_id: int) -> None:
+        """A sighting, if there is one."""
+        if self._sightings.get(plane_id, {}).pop(keyframe, None) is not None:
+            del self._factors[keyframe, plane_id]
+            self._change.remove((keyframe, plane_id))
 
     def _restart(self) -> None:
-        """Solve everything anew, damped, and hand the result to a new solver."""
+        """Solve everything anew, damped, and hand the result to a new solver, a careful one."""
+        self._solver = make_solver(self._config, careful=True)
         try:
-            self._values = Batch().update(self._all_factors(), self._values)
-            self._rebuild()
-            self._values = self._solver.update(self._fresh_factors, self._fresh_values)
+            self._values = Batch().update(self._everything())
+            self._values = self._solver.update(self._everything())
         except RuntimeError as error:
-            self._rebuild()
+            self._solver, self._change = make_solver(self._config, careful=True), self._everything()
             raise GraphError(f"the pose graph has no solution: {_first_line(error)}") from error
-        self._fresh_factors, self._fresh_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
 
-    def _all_factors(self) -> gtsam.NonlinearFactorGraph:
-        graph = gtsam.NonlinearFactorGraph()
-        if self._origin is not None:
-            graph.push_back(anchor_factor(*self._origin))
-        for edge in self._edges:
-            graph.push_back(self._factors.edge(edge))
-        for sighting in self._sightings:
-            graph.push_back(self._factors.plane(sighting))
-        return graph
+    def _everything(self) -> Change:
+        """What a new solver that is to start from the present values has to be told."""
+        return Change(dict(self._factors), gtsam.Values(self._values))
+
+
+def _equal(first: PlaneEstimate, second: PlaneEstimate) -> bool:
+    pairs = zip(vars(first).values(), vars(second).values(), strict=True)
+    return all(np.array_equal(a, b) for a, b in pairs)
 
 
 def _first_line(error: Exception) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Iterable, Sequence
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import gtsam
@@ -13,11 +14,29 @@ _ROUNDS = 5  # updates at most of one call, until nothing has to be linearised a
 _MAX_ITERATIONS = 50  # of the batch solver, which mostly ends long before by itself
 
 
+@dataclass
+class Change:
+    """What is new in a graph and what is gone, since a solver was told last."""
+
+    factors: dict[Hashable, gtsam.NonlinearFactor] = field(default_factory=dict)  # by names
+    values: gtsam.Values = field(default_factory=gtsam.Values)  # first values of new variables
+    gone: set[Hashable] = field(default_factory=set)  # names of factors; they go before the new ones come
+
+    def add(self, name: Hashable, factor: gtsam.NonlinearFactor) -> None:
+        """A factor, in the place of one of the same name that has been added since."""
+        self.factors[name] = factor
+
+    def remove(self, name: Hashable) -> None:
+        """A factor that there is, be it new or not."""
+        if self.factors.pop(name, None) is None:
+            self.gone.add(name)
+
+
 class Solver(Protocol):
     """How the graph is solved."""
 
-    def update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
-        """Take in new factors and first values of new variables; returns all values."""
+    def update(self, change: Change) -> gtsam.Values:
+        """Take in a change; returns all values."""
         ...
 
     def covariance(self, keys: Sequence[int]) -> gtsam.JointMarginal:
@@ -26,18 +45,26 @@ class Solver(Protocol):
 
 
 class Incremental:
-    """iSAM2."""
+    """iSAM2. Variables that no factor is left of go by themselves."""
 
-    def __init__(self, threshold: float) -> None:
+    def __init__(self, threshold: float, *, careful: bool) -> None:
+        """careful: QR in place of Cholesky, whose squares may be too much for what is known a little in places.
+
+        It then fails, and says so. QR takes up to four times as long.
+        """
         params = gtsam.ISAM2Params()
         params.relinearizeSkip = 1
-        params.setFactorization("QR")  # the squares of Cholesky's are too much for what is known a little in places
+        params.findUnusedFactorSlots = True
+        params.setFactorization("QR" if careful else "CHOLESKY")
         params.setRelinearizeThreshold(threshold)
         self._isam = gtsam.ISAM2(params)
+        self._slots: dict[Hashable, int] = {}  # of the factors, by their names
 
-    def update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+    def update(self, change: Change) -> gtsam.Values:
         """See `Solver.update`."""
-        self._isam.update(factors, values)
+        gone = [self._slots.pop(name) for name in change.gone]
+        result = self._isam.update(_graph(change.factors.values()), change.values, gone)
+        self._slots.update(zip(change.factors, result.getNewFactorsIndices(), strict=True))
         for _ in range(_ROUNDS - 1):
             if self._isam.update().getVariablesRelinearized() == 0:
                 break
@@ -52,24 +79,36 @@ class Batch:
     """Levenberg-Marquardt over everything, each time."""
 
     def __init__(self) -> None:
-        self._graph = gtsam.NonlinearFactorGraph()
+        self._factors: dict[Hashable, gtsam.NonlinearFactor] = {}
         self._values = gtsam.Values()
 
-    def update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+    def update(self, change: Change) -> gtsam.Values:
         """See `Solver.update`."""
-        self._graph.push_back(factors)
-        self._values.insert(values)
+        for name in change.gone:
+            del self._factors[name]
+        self._factors.update(change.factors)
+        self._values.insert(change.values)
+        graph = _graph(self._factors.values())
+        for key in set(self._values.keys()) - set(graph.keyVector()):
+            self._values.erase(key)
         params = gtsam.LevenbergMarquardtParams()
         params.setMaxIterations(_MAX_ITERATIONS)
         params.setLinearSolverType("MULTIFRONTAL_QR")
-        self._values = gtsam.LevenbergMarquardtOptimizer(self._graph, self._values, params).optimize()
+        self._values = gtsam.LevenbergMarquardtOptimizer(graph, self._values, params).optimize()
         return gtsam.Values(self._values)
 
     def covariance(self, keys: Sequence[int]) -> gtsam.JointMarginal:
         """See `Solver.covariance`."""
-        return gtsam.Marginals(self._graph, self._values).jointMarginalCovariance(list(keys))
+        return gtsam.Marginals(_graph(self._factors.values()), self._values).jointMarginalCovariance(list(keys))
 
 
-def make_solver(config: SolvingSettings) -> Solver:
-    """The one that the config names, empty."""
-    return Incremental(config.relinearise) if config.graph_solver == "incremental" else Batch()
+def make_solver(config: SolvingSettings, *, careful: bool = False) -> Solver:
+    """The one that the config names, empty. careful: for a graph that another one has taken for singular."""
+    return Incremental(config.relinearise, careful=careful) if config.graph_solver == "incremental" else Batch()
+
+
+def _graph(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        graph.push_back(factor)
+    return graph

@@ -76,7 +76,8 @@ class PlaneEstimate:
         """
         variance = np.broadcast_to(np.square(sigma_m), np.shape(areas_m2))
         turn = variance / np.maximum(areas_m2, 1e-4)
-        added = np.stack([turn, turn, variance], axis=-1)[..., None] * np.eye(3)
+        added = np.zeros((*variance.shape, 3, 3))
+        added[..., 0, 0], added[..., 1, 1], added[..., 2, 2] = turn, turn, variance
         return self._with_covariance(self.covariance + added)
 
     def with_sensor_bias(self, areas_m2: Vector, per_m2: float) -> PlaneEstimate:

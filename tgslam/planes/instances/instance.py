@@ -102,6 +102,10 @@ class PlanarInstance:
         sigma_m = self._config.expert.uncertainty.planarity_sigma_m if surface_sigma_m is None else surface_sigma_m
         return self._views.of(keyframe, sigma_m)
 
+    def views(self, surface_sigma_m: float) -> dict[int, PlaneEstimate]:
+        """All views that are still known, by keyframe; see `view`."""
+        return self._views.by_keyframe(surface_sigma_m)
+
     def add_view(self, keyframe: int, local: PlaneEstimate, area_m2: float, rms_m: float, poses: Poses) -> None:
         """A plane in a keyframe's camera frame, as certain as the sensor's noise leaves it, is this one. Refits."""
         self._take(Views.one(keyframe, local, area_m2, rms_m))
@@ -113,6 +117,7 @@ class PlanarInstance:
         """Take over all that another instance has: the two are one."""
         self._take(other._views)
         self.keyframes = sorted({*self.keyframes, *other.keyframes})
+        self.lineage.revision += 1
         self.record.seen_past |= other.record.seen_past
         cells, keyframes = other.support.cells()
         self.support.absorb(other.support.centres(cells), keyframes)
@@ -147,6 +152,7 @@ class PlanarInstance:
         other.lineage.split_from = self
         other._take(self._views[fewer])
         self._views = self._views[~fewer]
+        self.lineage.revision += 1
         other.keyframes = sorted({int(k) for k in other._views.keyframes})
         self.keyframes = [k for k in self.keyframes if k not in other.keyframes]
         cells, keyframes = self.support.cells()

@@ -16,6 +16,7 @@ class Lineage:
     split_from: PlanarInstance | None = None  # of which it was taken for a part
     merged_into: PlanarInstance | None = None  # which has all that it had
     part_of: PlanarInstance | None = None  # whose unevenness it is: then it goes by that one's id
+    revision: int = 0  # how often it got or lost views otherwise than by being seen
 
     @property
     def heir(self) -> PlanarInstance | None:

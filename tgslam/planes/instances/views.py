@@ -66,11 +66,16 @@ class Views:
 
         surface_sigma_m: by what the surface strays from its plane.
         """
-        index = np.flatnonzero(self.keyframes == keyframe)
-        if len(index) == 0:
-            return None
-        planes = self.planes[index].with_surface_error(self.areas_m2[index], surface_sigma_m)
-        return planes[0] if len(index) == 1 else fuse(planes)
+        seen = slice(*np.searchsorted(self.keyframes, [keyframe, keyframe + 1]).tolist())
+        planes = self.planes[seen].with_surface_error(self.areas_m2[seen], surface_sigma_m)
+        return fuse(planes) if len(planes.normal) > 1 else planes[0] if len(planes.normal) else None
+
+    def by_keyframe(self, surface_sigma_m: float) -> dict[int, PlaneEstimate]:
+        """The plane as each keyframe saw it; see `of`."""
+        planes = self.planes.with_surface_error(self.areas_m2, surface_sigma_m)
+        keyframes, first, counts = np.unique(self.keyframes, return_index=True, return_counts=True)
+        found = zip(keyframes.tolist(), first.tolist(), counts.tolist(), strict=True)
+        return {k: planes[i] if count == 1 else fuse(planes[i : i + count]) for k, i, count in found}
 
     def fused(self, poses: Poses, config: UncertaintySettings) -> tuple[PlaneEstimate, PlaneEstimate]:
         """The plane that all views agree on, at the poses that their keyframes have now, in the world.
