@@ -140,11 +140,12 @@ class GraphClosing:
 
     def _motions(self, T_cw: NDArray[np.float64]) -> dict[int, Matrix4]:
         """Of all keyframes once one of them has moved enough to matter."""
-        motions = inverse(T_cw) @ np.stack(self._followed)
-        shifts_m = np.linalg.norm(inverse(T_cw)[:, :3, 3] - inverse(np.stack(self._followed))[:, :3, 3], axis=1)
+        T_wc, followed = inverse(T_cw), np.array(self._followed)
+        motions = T_wc @ followed
+        shifts_m = np.linalg.norm(T_wc[:, :3, 3] - inverse(followed)[:, :3, 3], axis=1)
         turns_rad = np.linalg.norm(motions[:, :3, :3] - np.eye(3), axis=(1, 2)) / np.sqrt(2.0)
         least = self._config.expert.follow
         if shifts_m.max() < least.least_shift_m and turns_rad.max() < least.least_turn_rad:
             return {}
-        self._followed = [T.copy() for T in T_cw]
+        self._followed = list(T_cw.copy())
         return dict(enumerate(motions))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import gtsam
+import numpy as np
 
 from tgslam.config.graph_settings import SolvingSettings
 
@@ -57,6 +58,7 @@ class Incremental:
         params.findUnusedFactorSlots = True
         params.setFactorization("QR" if careful else "CHOLESKY")
         params.setRelinearizeThreshold(threshold)
+        self._threshold = threshold
         self._isam = gtsam.ISAM2(params)
         self._slots: dict[Hashable, int] = {}  # of the factors, by their names
 
@@ -65,10 +67,18 @@ class Incremental:
         gone = [self._slots.pop(name) for name in change.gone]
         result = self._isam.update(_graph(change.factors.values()), change.values, gone)
         self._slots.update(zip(change.factors, result.getNewFactorsIndices(), strict=True))
+        estimate = self._isam.calculateEstimate()
         for _ in range(_ROUNDS - 1):
-            if self._isam.update().getVariablesRelinearized() == 0:
+            if not self._has_moved(estimate):
                 break
-        return self._isam.calculateEstimate()
+            self._isam.update()
+            estimate = self._isam.calculateEstimate()
+        return estimate
+
+    def _has_moved(self, estimate: gtsam.Values) -> bool:
+        """Whether a keyframe is no longer where it was linearised. Planes alone wait for the next call."""
+        there = gtsam.utilities.extractPose3(self._isam.getLinearizationPoint())
+        return bool(np.abs(gtsam.utilities.extractPose3(estimate) - there).max(initial=0.0) > self._threshold)
 
     def covariance(self, keys: Sequence[int]) -> gtsam.JointMarginal:
         """See `Solver.covariance`."""
