@@ -178,6 +178,15 @@ def test_planes_that_merge_are_one_landmark_from_then_on() -> None:
     assert other != first
 
 
+def test_poses_stay_rotations_over_many_keyframes() -> None:
+    """Motions are taken between poses that the graph itself gave: rounding must not double with each keyframe."""
+    walk, closing = Walk(4, count=70), GraphClosing(CAMERA, NOISE, CONFIG, LoopConfig(enabled=False))
+    for _ in walk.truth:
+        walk.add(closing)
+    R = closing._graph.estimate().T_cw[:, :3, :3]
+    np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.tile(np.eye(3), (70, 1, 1)), atol=1e-10)
+
+
 def test_without_planes_and_loops_there_is_no_graph() -> None:
     no_planes, no_loops = PlanesConfig(enabled=False), LoopConfig(enabled=False)
     assert Slam(CAMERA, Config())._closing

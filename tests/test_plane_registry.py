@@ -417,7 +417,9 @@ def test_moving_keyframes_back_merges_what_drift_had_parted() -> None:
     _, second = stage.show(HERE, believed=HERE @ inverse(drift))
     assert first[0] != second[0]
     assert first[1] == second[1]  # the floor was not affected
+    assert stage.registry.instances[first[0][0]].lineage.revision == 0
     assert stage.registry.move({1: inverse(drift)}) == ((first[0][0], second[0][0]),)
+    assert stage.registry.instances[first[0][0]].lineage.revision == 1
     assert len(stage.registry.instances) == 2
 
 
@@ -429,6 +431,7 @@ def test_two_surfaces_that_were_taken_for_one_are_split() -> None:
     ids = {plane_id for _, found in turns for plane_id in found[0]}
     offsets = sorted(instance.offset_m for instance in stage.registry.instances.values())
     assert len(ids) >= 2
+    assert stage.registry.instances[min(ids)].lineage.revision > 0  # it has lost views to the other one
     assert_allclose(offsets[0], 2.94, atol=0.015)
     assert_allclose(offsets[-1], 3.0, atol=0.015)
 

@@ -89,3 +89,18 @@ def test_many_views_are_thinned_evenly() -> None:
     assert_array_equal(views.areas_m2, 1.0 + views.keyframes)
     assert views.of(1, 0.0) is None or 1 in views.keyframes
     assert views.of(0, 0.0) is not None
+
+
+def test_all_views_by_keyframe_are_those_of_each() -> None:
+    rng = np.random.default_rng(0)
+    views = Views.none()
+    for keyframe in (2, 3, 3, 7):
+        offset = np.asarray(2.0 + 0.01 * rng.random())
+        plane = PlaneEstimate(np.array([0.0, 0.0, -1.0]), offset, np.array([0, 0, offset]), np.eye(3)[:2], np.eye(3))
+        views = views.joined(Views.one(keyframe, plane, 0.5 + keyframe, 0.001), 20)
+    found = views.by_keyframe(0.003)
+    assert list(found) == [2, 3, 7]
+    for keyframe, plane in found.items():
+        for name, value in vars(views.of(keyframe, 0.003)).items():
+            assert_array_equal(getattr(plane, name), value)
+    assert views.of(4, 0.003) is None

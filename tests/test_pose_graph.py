@@ -22,6 +22,7 @@ from tgslam.graph.factors import PlaneError, Sighting, whitening
 from tgslam.graph.gating import passes
 from tgslam.graph.pose_graph import GraphEstimate, PoseGraph
 from tgslam.graph.relative import measure
+from tgslam.graph.solvers import Change, Incremental, make_solver
 from tgslam.graph.structure.candidates import candidates, shared_planes
 from tgslam.planes.estimate import PlaneEstimate
 from tgslam.relative_motion import Measurement
@@ -307,6 +308,66 @@ def test_planes_that_merge_and_end(solver: str) -> None:
     assert 5 not in graph.optimise().plane_ids
     replace_planes(graph, [])
     assert len(graph.optimise().planes) == 0
+
+
+def test_a_merge_changes_its_own_sightings_alone_and_ends_where_a_new_graph_would(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    truth, motions, views = simulated(ROOM, turning, 20, 0)
+    config = SolvingSettings(relinearise=1e-6, robust="none")
+    merged, fresh = PoseGraph(config), PoseGraph(config)
+    for graph in (merged, fresh):
+        chain(graph, truth[0], motions)
+    for k, seen in enumerate(views):
+        merged.add_plane_observations([Sighting(k, 10 if i == 2 and k < 10 else i, p) for i, p in seen.items()])
+        fresh.add_plane_observations([Sighting(k, i, plane) for i, plane in seen.items()])
+    merged.optimise()
+    told: list[Change] = []
+    update = Incremental.update
+    monkeypatch.setattr(Incremental, "update", lambda solver, change: told.append(change) or update(solver, change))
+    merged.replace_plane(10, {})
+    merged.replace_plane(2, {k: seen[2] for k, seen in enumerate(views) if 2 in seen})
+    found, reference = merged.optimise(), fresh.optimise()
+    moved = {k for k, seen in enumerate(views) if 2 in seen and k < 10}
+    assert 0 < len(moved) < 10
+    assert told[0].gone == {(k, 10) for k in moved}
+    assert told[0].factors.keys() == {(k, 2) for k in moved}
+    assert found.plane_ids.tolist() == reference.plane_ids.tolist() == sorted({i for seen in views for i in seen})
+    assert_allclose(found.T_cw, reference.T_cw, atol=1e-6)
+    assert_allclose(found.planes, reference.planes, atol=1e-6)
+
+
+@pytest.mark.parametrize("solver", ["incremental", "batch"])
+def test_a_plane_seen_anew_by_a_keyframe_counts_once(solver: str) -> None:
+    """The keyframe is fixed, so the plane is where the latest sighting of it says."""
+    graph = PoseGraph(SolvingSettings(graph_solver=solver))
+    graph.add_first(0, np.eye(4))
+    plane = random_plane(np.random.default_rng(0), sigma=1e-3)
+    for error in (np.zeros(3), np.array([0.0, 0.0, 0.002])):
+        seen = shifted(plane, error)
+        graph.add_plane_observations([Sighting(0, 4, seen)])
+        found = graph.optimise()
+        assert_allclose(found.planes, [[*seen.normal, seen.offset_m]], atol=1e-6)
+    graph.replace_plane(4, {})
+    graph.replace_plane(4, {0: plane})
+    assert_allclose(graph.optimise().planes, [[*plane.normal, plane.offset_m]], atol=1e-6)
+
+
+def test_what_cholesky_cannot_solve_qr_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Planes known to a micrometre beside motions that hardly say anything: a condition of 1e18."""
+    truth, motions, views = simulated(ROOM, turning, 12, 0, noise=0.0)
+    graph = PoseGraph(SolvingSettings(robust="none"))
+    chain(graph, truth[0], [RelativePose(motion.T_ji, np.zeros((6, 6))) for motion in motions])
+    careful: list[bool] = []
+    monkeypatch.setattr(
+        "tgslam.graph.pose_graph.make_solver",
+        lambda config, **options: careful.append(options.get("careful", False)) or make_solver(config, **options),
+    )
+    for k, seen in enumerate(views):
+        exact = {i: replace(plane, covariance=1e-6 * plane.covariance) for i, plane in seen.items() if i in (0, 3)}
+        graph.add_plane_observations([Sighting(k, i, plane) for i, plane in exact.items()])
+    assert_allclose(graph.optimise().T_cw, truth, atol=1e-3)
+    assert careful == [True]
 
 
 def test_the_first_keyframe_stays_and_others_come_back_in_order() -> None:
