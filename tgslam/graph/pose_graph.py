@@ -43,9 +43,7 @@ class PoseGraph:
         self._edges: list[Edge] = []
         self._sightings: dict[int, dict[int, PlaneEstimate]] = {}  # by plane, then by keyframe
         self._origin: tuple[int, Vector] | None = None
-        self._factors: dict[
-            Hashable, gtsam.NonlinearFactor
-        ] = {}  # all; of sightings by (keyframe, plane), of edges by number
+        self._factors: dict[Hashable, gtsam.NonlinearFactor] = {}  # sightings' by (keyframe, plane), edges' by number
         self._values = gtsam.Values()  # the latest estimate, with a first guess of what is new
         self._change = Change()  # that the solver has not been told yet
         self._solver = make_solver(config)
