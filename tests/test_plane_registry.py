@@ -431,7 +431,6 @@ def test_two_surfaces_that_were_taken_for_one_are_split() -> None:
     ids = {plane_id for _, found in turns for plane_id in found[0]}
     offsets = sorted(instance.offset_m for instance in stage.registry.instances.values())
     assert len(ids) >= 2
-    assert stage.registry.instances[min(ids)].lineage.revision > 0  # it has lost views to the other one
     assert_allclose(offsets[0], 2.94, atol=0.015)
     assert_allclose(offsets[-1], 3.0, atol=0.015)
 

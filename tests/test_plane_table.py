@@ -6,6 +6,7 @@ import numpy as np
 from numpy.testing import assert_array_equal
 
 from tests.plane_views import Rectangle, Stage, looking
+from tgslam.config.plane_settings import PlanesConfig
 from tgslam.geometry import se3_exp
 from tgslam.planes.estimate import PlaneEstimate
 from tgslam.planes.instances.instance import PlanarInstance
@@ -104,3 +105,22 @@ def test_all_views_by_keyframe_are_those_of_each() -> None:
         for name, value in vars(views.of(keyframe, 0.003)).items():
             assert_array_equal(getattr(plane, name), value)
     assert views.of(4, 0.003) is None
+
+
+def test_an_instance_tells_that_it_got_or_lost_views_otherwise_than_by_being_seen() -> None:
+    def wall(depth_m: float) -> PlaneEstimate:
+        normal, centroid = np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, depth_m])
+        return PlaneEstimate(normal, np.asarray(depth_m), centroid, np.eye(3)[:2], 1e-6 * np.eye(3))
+
+    poses = {keyframe: np.eye(4) for keyframe in range(12)}
+    instance = PlanarInstance(wall(2.0), PlanesConfig())
+    for keyframe in poses:
+        instance.add_view(keyframe, wall(2.2 if keyframe % 2 else 2.0), 1.0, 0.001, poses)
+    assert instance.lineage.revision == 0
+    other = instance.split(poses)
+    assert other is not None
+    assert instance.lineage.revision == 1
+    assert sorted(instance.keyframes + other.keyframes) == list(poses)
+    instance.absorb(other, poses)
+    assert instance.lineage.revision == 2
+    assert list(instance.views(0.001)) == list(poses)
