@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tgslam.camera import Camera
 from tgslam.config.input_settings import DatasetConfig
 from tgslam.errors import ConfigError
+from tgslam.types import Matrix4
 
 _log = logging.getLogger(__name__)
 _DISTORTION_LENGTHS = (4, 5, 8, 12, 14)  # OpenCV's models
@@ -42,6 +43,19 @@ class Calibration:
         if self.flips_rows:
             return Camera(width, height, self.fx, -self.fy, self.cx, height - 1 - self.cy)
         return Camera(width, height, self.fx, self.fy, self.cx, self.cy)
+
+
+@dataclass(frozen=True)
+class DepthCamera:
+    """A depth camera of its own: its intrinsics, for images of `calibration.size`, and where it is."""
+
+    calibration: Calibration
+    T_colour_depth: Matrix4  # [4, 4] maps points of the depth camera's frame to the colour camera's, m
+
+    @property
+    def is_concentric(self) -> bool:
+        """Whether it stands where the colour camera does and looks the same way, to within 0.1 mm and 0.1 mrad."""
+        return bool(np.allclose(self.T_colour_depth, np.eye(4), atol=1e-4))
 
 
 def resolve(config: DatasetConfig, default: Calibration | None, hint: str) -> Calibration:

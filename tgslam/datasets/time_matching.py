@@ -2,8 +2,25 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+_log = logging.getLogger(__name__)
+# Clocks that count since 1970 in these units, s, pass these values
+_CLOCKS = (("nanoseconds", 1e-9, 1e17), ("microseconds", 1e-6, 1e14), ("milliseconds", 1e-3, 1e11))
+
+
+def seconds_in(times: ArrayLike, name: str) -> float:
+    """Seconds in the unit of times [N] that count since 1970; 1 for all others. What is no second is logged."""
+    values = np.asarray(times, np.float64)
+    median = float(np.median(values)) if values.size else 0.0
+    for unit, seconds, least in _CLOCKS:
+        if median > least:
+            _log.warning("%s: its times are in %s since 1970, and are read so", name, unit)
+            return seconds
+    return 1.0
 
 
 def associate_times(

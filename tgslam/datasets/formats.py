@@ -1,0 +1,24 @@
+"""All layouts that can be read, in the order in which a folder or file is tried for them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tgslam.datasets.icl import ICL
+from tgslam.datasets.layout import Layout
+from tgslam.datasets.layouts.replica import REPLICA
+from tgslam.datasets.tum import TUM
+
+LAYOUTS: tuple[Layout, ...] = (TUM, ICL, REPLICA)
+
+
+def layout_named(name: str) -> Layout | None:
+    """The layout that `dataset.format` calls so."""
+    return next((layout for layout in LAYOUTS if layout.name == name), None)
+
+
+def layout_of(path: Path) -> Layout | None:
+    """The layout that a folder or file, which exists, looks like."""
+    is_file = path.is_file()
+    candidates = (layout for layout in LAYOUTS if layout.is_file or not is_file)
+    return next((layout for layout in candidates if layout.recognises(path)), None)
