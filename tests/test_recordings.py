@@ -7,16 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.recordings.rendered import REPLICA
+from tests.recordings.kinect import BUNDLE_FUSION, SCANNET, SCENES_MOTION, SENS, SEVEN_SCENES
+from tests.recordings.rendered import REPLICA, TARTANAIR_V1, TARTANAIR_V2
 from tests.recordings.shots import Case, shots
 from tgslam.config.input_settings import FOLDER_FORMATS, DatasetConfig, SyntheticConfig
-from tgslam.datasets import RgbdSource, open_source
+from tgslam.datasets import RgbdSource, open_source, open_stored
 from tgslam.datasets.detection import told_format
 from tgslam.datasets.formats import LAYOUTS
 from tgslam.errors import TgslamError
 from tgslam.geometry import inverse
+from tgslam.types import Trajectory
 
-CASES = [REPLICA]
+REGISTERED = [REPLICA, TARTANAIR_V1, TARTANAIR_V2, BUNDLE_FUSION, SCANNET, SENS]
+CASES = [*REGISTERED, SEVEN_SCENES]
 
 
 def opened(case: Case, path: Path) -> RgbdSource:
@@ -25,7 +28,7 @@ def opened(case: Case, path: Path) -> RgbdSource:
     return open_source(config, SyntheticConfig(), 0, path)
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.label)
+@pytest.mark.parametrize("case", REGISTERED, ids=lambda case: case.label)
 def test_frames_and_poses_are_those_that_were_written(case: Case, tmp_path: Path) -> None:
     source = opened(case, case.write(tmp_path))
     assert len(source) == 3
@@ -36,12 +39,11 @@ def test_frames_and_poses_are_those_that_were_written(case: Case, tmp_path: Path
         np.testing.assert_allclose(frame.colour, shot.colour / 255.0, atol=(case.colour_steps + 0.01) / 255)
         np.testing.assert_allclose(frame.depth_m, shot.depth_m, atol=2e-4)
         assert frame.colour.dtype == frame.depth_m.dtype == np.float32
-    check_poses(case, source)
+    check_poses(case, source.groundtruth())
 
 
-def check_poses(case: Case, source: RgbdSource) -> None:
+def check_poses(case: Case, truth: Trajectory | None) -> None:
     """Motions are the same, whatever the recording's world."""
-    truth = source.groundtruth()
     if not case.has_poses:
         assert truth is None
         return
@@ -49,6 +51,18 @@ def check_poses(case: Case, source: RgbdSource) -> None:
     np.testing.assert_allclose(truth.timestamps_s, case.times_s, atol=1e-6)
     written = np.stack([shot.T_wc for shot in shots()])
     np.testing.assert_allclose(inverse(truth.T_wc[0]) @ truth.T_wc, inverse(written[0]) @ written, atol=2e-6)
+
+
+def test_seven_scenes_has_a_depth_camera_of_its_own(tmp_path: Path) -> None:
+    path, config = SEVEN_SCENES.write(tmp_path), DatasetConfig(format="7scenes", fx=30.0, fy=31.0, cx=15.0, cy=11.5)
+    stored = open_stored(config, path)
+    assert stored.depth_camera is not None and stored.depth_units == 1000.0
+    np.testing.assert_array_equal(stored.depth_camera.T_colour_depth, SCENES_MOTION)
+    assert stored.depth_camera.calibration.matrix.tolist() == [[585, 0, 320], [0, 585, 240], [0, 0, 1]]
+    for k, shot in enumerate(shots()):
+        np.testing.assert_array_equal(stored.frames.colour(k), shot.colour)
+        np.testing.assert_array_equal(stored.frames.depth(k), shot.depth_mm)
+    check_poses(SEVEN_SCENES, stored.poses())
 
 
 DAMAGES = [(case, name) for case in CASES for name in case.damages]
@@ -60,10 +74,11 @@ def test_damage_is_said_in_one_line_that_names_the_file(case: Case, name: str, t
     path = case.write(tmp_path)
     damage(path)
     with pytest.raises(TgslamError, match=message) as caught:
-        source = opened(case, path)
-        source.groundtruth()
-        for k in range(3):
-            source.read(k)
+        config = told_format(DatasetConfig(**case.settings), path)
+        stored = open_stored(config, path)
+        stored.poses()
+        for k in range(len(stored.frames.times_s)):
+            stored.frames.colour(k), stored.frames.depth(k)
     assert "\n" not in str(caught.value)
 
 

@@ -6,10 +6,15 @@ from pathlib import Path
 
 from tgslam.datasets.icl import ICL
 from tgslam.datasets.layout import Layout
+from tgslam.datasets.layouts.bundle_fusion import BUNDLE_FUSION
 from tgslam.datasets.layouts.replica import REPLICA
+from tgslam.datasets.layouts.scannet import SCANNET
+from tgslam.datasets.layouts.sens_file import SENS
+from tgslam.datasets.layouts.seven_scenes import SEVEN_SCENES
+from tgslam.datasets.layouts.tartanair import TARTANAIR
 from tgslam.datasets.tum import TUM
 
-LAYOUTS: tuple[Layout, ...] = (TUM, ICL, REPLICA)
+LAYOUTS: tuple[Layout, ...] = (TUM, ICL, REPLICA, BUNDLE_FUSION, SEVEN_SCENES, TARTANAIR, SENS, SCANNET)
 
 
 def layout_named(name: str) -> Layout | None:

@@ -95,6 +95,11 @@ def decode_raw_depth(data: bytes, name: str) -> NDArray[Any]:
     return raw
 
 
+def read_unchanged(path: Path) -> NDArray[Any]:
+    """An image file with the channels, in OpenCV's order, and bits that it has. Raises FrameError."""
+    return _decode(_read(path), str(path), cv2.IMREAD_UNCHANGED)
+
+
 def depth_in_metres(raw: NDArray[Any], units_per_metre: float, min_m: float, max_m: float) -> FloatImage:
     """Raw depth [H, W] -> metres; values outside [min_m, max_m] become 0 (no measurement). Floats are metres."""
     if raw.dtype.kind == "f":
