@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.recordings.folders import BONN, FOLDER, OPEN3D, REDWOOD
 from tests.recordings.kinect import BUNDLE_FUSION, SCANNET, SCENES_MOTION, SENS, SEVEN_SCENES
+from tests.recordings.phones import NERFSTUDIO, POLYCAM, RECORD3D, SCANNETPP, record3d_members, write_zip
 from tests.recordings.rendered import REPLICA, TARTANAIR_V1, TARTANAIR_V2
 from tests.recordings.shots import Case, shots
 from tgslam.config.input_settings import FOLDER_FORMATS, DatasetConfig, SyntheticConfig
 from tgslam.datasets import RgbdSource, open_source, open_stored
 from tgslam.datasets.detection import told_format
 from tgslam.datasets.formats import LAYOUTS
-from tgslam.errors import TgslamError
+from tgslam.errors import FrameError, TgslamError
 from tgslam.geometry import inverse
 from tgslam.types import Trajectory
 
-REGISTERED = [REPLICA, TARTANAIR_V1, TARTANAIR_V2, BUNDLE_FUSION, SCANNET, SENS]
+REGISTERED = [
+    REPLICA, TARTANAIR_V1, TARTANAIR_V2, BUNDLE_FUSION, SCANNET, SENS, OPEN3D, REDWOOD, BONN, FOLDER, NERFSTUDIO,
+    SCANNETPP, RECORD3D, POLYCAM,
+]  # fmt: skip
 CASES = [*REGISTERED, SEVEN_SCENES]
 
 
@@ -85,3 +92,27 @@ def test_damage_is_said_in_one_line_that_names_the_file(case: Case, name: str, t
 def test_every_layout_is_a_format_and_has_three_damages() -> None:
     assert {layout.name for layout in LAYOUTS} <= set(FOLDER_FORMATS)
     assert all(len(case.damages) >= 3 for case in CASES)
+
+
+def test_depth_of_record3d_by_lzfse(tmp_path: Path) -> None:
+    lzfse = pytest.importorskip("lzfse")
+    path = write_zip(tmp_path / "room.r3d", record3d_members(lzfse.compress))
+    frames = open_stored(DatasetConfig(format="record3d"), path).frames
+    np.testing.assert_array_equal(frames.depth(1), shots()[1].depth_m)
+    damaged = write_zip(tmp_path / "bad.r3d", record3d_members(lambda data: lzfse.compress(data)[:-9]))
+    with pytest.raises(FrameError, match=r"bad\.r3d: rgbd/1\.depth: "):
+        open_stored(DatasetConfig(format="record3d"), damaged).frames.depth(1)
+
+
+def test_lzfse_that_is_not_installed_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "lzfse", None)
+    path = write_zip(tmp_path / "room.r3d", record3d_members(lambda data: b"bvx2" + data))
+    with pytest.raises(FrameError, match=r"pip install tgslam\[record3d\]"):
+        open_stored(DatasetConfig(format="record3d"), path).frames.depth(0)
+
+
+def test_an_unpacked_record3d_is_read_too(tmp_path: Path) -> None:
+    zipfile.ZipFile(write_zip(tmp_path / "room.r3d", record3d_members())).extractall(tmp_path / "room")
+    source = opened(RECORD3D, tmp_path / "room")
+    np.testing.assert_allclose(source.read(2).depth_m, shots()[2].depth_m, atol=1e-6)
+    check_poses(RECORD3D, source.groundtruth())

@@ -6,15 +6,25 @@ from pathlib import Path
 
 from tgslam.datasets.icl import ICL
 from tgslam.datasets.layout import Layout
+from tgslam.datasets.layouts.bonn import BONN
 from tgslam.datasets.layouts.bundle_fusion import BUNDLE_FUSION
+from tgslam.datasets.layouts.described import FOLDER
+from tgslam.datasets.layouts.nerfstudio import NERFSTUDIO
+from tgslam.datasets.layouts.open3d_recording import OPEN3D
+from tgslam.datasets.layouts.polycam import POLYCAM
+from tgslam.datasets.layouts.record3d import RECORD3D
 from tgslam.datasets.layouts.replica import REPLICA
 from tgslam.datasets.layouts.scannet import SCANNET
+from tgslam.datasets.layouts.scannetpp import SCANNETPP
 from tgslam.datasets.layouts.sens_file import SENS
 from tgslam.datasets.layouts.seven_scenes import SEVEN_SCENES
 from tgslam.datasets.layouts.tartanair import TARTANAIR
 from tgslam.datasets.tum import TUM
 
-LAYOUTS: tuple[Layout, ...] = (TUM, ICL, REPLICA, BUNDLE_FUSION, SEVEN_SCENES, TARTANAIR, SENS, SCANNET)
+LAYOUTS: tuple[Layout, ...] = (
+    FOLDER, BONN, TUM, ICL, REPLICA, BUNDLE_FUSION, SEVEN_SCENES, TARTANAIR, SENS, SCANNET, SCANNETPP, NERFSTUDIO,
+    RECORD3D, POLYCAM, OPEN3D,
+)  # fmt: skip
 
 
 def layout_named(name: str) -> Layout | None:

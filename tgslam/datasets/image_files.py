@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.datasets.image_header import MOST_PIXELS, check_claimed_size
-from tgslam.errors import FrameError
+from tgslam.errors import DatasetError, FrameError
 from tgslam.pixels import depth_as_metres
 from tgslam.types import FloatImage
 
@@ -98,6 +98,19 @@ def decode_raw_depth(data: bytes, name: str) -> NDArray[Any]:
 def read_unchanged(path: Path) -> NDArray[Any]:
     """An image file with the channels, in OpenCV's order, and bits that it has. Raises FrameError."""
     return _decode(_read(path), str(path), cv2.IMREAD_UNCHANGED)
+
+
+def size_of_first(paths: Sequence[Path]) -> tuple[int, int]:
+    """Width and height of the first image of a recording that can be read. Raises DatasetError if none can."""
+    first_error = ""
+    for path in paths:
+        try:
+            height, width = read_unchanged(path).shape[:2]
+        except FrameError as error:
+            first_error = first_error or str(error)
+        else:
+            return width, height
+    raise DatasetError(f"none of {len(paths)} images can be read; the first: {first_error}")
 
 
 def depth_in_metres(raw: NDArray[Any], units_per_metre: float, min_m: float, max_m: float) -> FloatImage:

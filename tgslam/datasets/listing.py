@@ -32,6 +32,11 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
     return dict(sorted((int(match[1]), path) for match, path in matches if match))
 
 
+def natural_order(name: str) -> list[tuple[int, str]]:
+    """A key by which frame2 comes before frame10."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
 def pairs_by_number(
     colour: Mapping[int, Path], depth: Mapping[int, Path], folder: Path, expected: str
 ) -> list[Numbered]:

@@ -18,7 +18,6 @@ from tgslam.datasets.layouts.bundle_fusion import motion_between
 from tgslam.datasets.listing import Numbered, at_usual_rate, numbered_files, pairs_by_number
 from tgslam.datasets.pose_rows import poses_of_files, read_matrix
 from tgslam.datasets.stored import MILLIMETRES, ImageFrames, StoredRecording
-from tgslam.errors import DatasetError, FrameError
 from tgslam.geometry import inverse
 from tgslam.types import Matrix4
 
@@ -45,19 +44,8 @@ def open_scannet(folder: Path, config: DatasetConfig) -> StoredRecording:
 def _calibration(folder: Path, kind: str, pairs: list[Numbered]) -> Calibration:
     """The file does not say for which size of image: it is that of the first image that can be read."""
     path = folder / "intrinsic" / f"intrinsic_{kind}.txt"
-    return of_matrix(read_matrix(path), _size([pair.colour if kind == "color" else pair.depth for pair in pairs]))
-
-
-def _size(paths: list[Path]) -> tuple[int, int]:
-    first_error = ""
-    for path in paths:
-        try:
-            height, width = images.read_unchanged(path).shape[:2]
-        except FrameError as error:
-            first_error = first_error or str(error)
-        else:
-            return width, height
-    raise DatasetError(f"none of {len(paths)} images can be read; the first: {first_error}")
+    paths = [pair.colour if kind == "color" else pair.depth for pair in pairs]
+    return of_matrix(read_matrix(path), images.size_of_first(paths))
 
 
 def _extrinsic(folder: Path, kind: str) -> Matrix4:

@@ -1,8 +1,8 @@
 """TartanAir, V1 and V2: images and depth of the left camera of a trajectory such as P000.
 
 Sources: https://theairlab.org/tartanair-dataset/ and https://tartanair.org. V1 has depth as float32 NPY in metres, V2
-as PNG whose four bytes a pixel are one float32. Poses are north-east-down: x forward, y right, z down. Ours are x right, y
-down, z forward. Images are 640x480 in V1 and 640x640 in V2, 90 degrees across.
+as PNG whose four bytes a pixel are one float32. Poses are north-east-down: x forward, y right, z down. Ours are x
+right, y down, z forward. Images are 640x480 in V1 and 640x640 in V2, 90 degrees across.
 """
 
 from __future__ import annotations
