@@ -9,22 +9,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.recordings.bags import MCAP, MOTION, REALSENSE, ROS1, ROS2
 from tests.recordings.folders import BONN, FOLDER, OPEN3D, REDWOOD
 from tests.recordings.kinect import BUNDLE_FUSION, SCANNET, SCENES_MOTION, SENS, SEVEN_SCENES
 from tests.recordings.phones import NERFSTUDIO, POLYCAM, RECORD3D, SCANNETPP, record3d_members, write_zip
 from tests.recordings.rendered import REPLICA, TARTANAIR_V1, TARTANAIR_V2
 from tests.recordings.shots import Case, shots
-from tgslam.config.input_settings import FOLDER_FORMATS, DatasetConfig, SyntheticConfig
+from tgslam.config.input_settings import FOLDER_FORMATS, DatasetConfig, DatasetExpert, SyntheticConfig
 from tgslam.datasets import RgbdSource, open_source, open_stored
 from tgslam.datasets.detection import told_format
 from tgslam.datasets.formats import LAYOUTS
-from tgslam.errors import FrameError, TgslamError
+from tgslam.errors import ConfigError, FrameError, TgslamError
 from tgslam.geometry import inverse
 from tgslam.types import Trajectory
 
 REGISTERED = [
     REPLICA, TARTANAIR_V1, TARTANAIR_V2, BUNDLE_FUSION, SCANNET, SENS, OPEN3D, REDWOOD, BONN, FOLDER, NERFSTUDIO,
-    SCANNETPP, RECORD3D, POLYCAM,
+    SCANNETPP, RECORD3D, POLYCAM, ROS1, ROS2, MCAP,
 ]  # fmt: skip
 CASES = [*REGISTERED, SEVEN_SCENES]
 
@@ -70,6 +71,27 @@ def test_seven_scenes_has_a_depth_camera_of_its_own(tmp_path: Path) -> None:
         np.testing.assert_array_equal(stored.frames.colour(k), shot.colour)
         np.testing.assert_array_equal(stored.frames.depth(k), shot.depth_mm)
     check_poses(SEVEN_SCENES, stored.poses())
+
+
+def test_realsense_has_a_depth_camera_of_its_own_and_its_units(tmp_path: Path) -> None:
+    stored = open_stored(DatasetConfig(format="ros"), REALSENSE.write(tmp_path))
+    assert stored.depth_camera is not None and stored.depth_units == pytest.approx(10_000.0)
+    np.testing.assert_allclose(stored.depth_camera.T_colour_depth[:3, 3], MOTION)
+    assert stored.depth_camera.calibration.matrix.tolist() == [[20, 0, 16], [0, 20, 12], [0, 0, 1]]
+    assert stored.calibration.matrix.tolist() == [[30, 0, 15], [0, 31, 11.5], [0, 0, 1]]
+    for k in (2, 0, 1):
+        np.testing.assert_array_equal(stored.frames.colour(k), shots()[k].colour)
+        np.testing.assert_array_equal(stored.frames.depth(k), shots()[k].depth_mm * 10)
+
+
+def test_topics_of_a_bag_may_be_named(tmp_path: Path) -> None:
+    topics = DatasetExpert(colour_topic="/camera/infra1/image_rect_raw", depth_topic="/camera/depth/image_rect_raw")
+    path = ROS1.write(tmp_path)
+    frames = open_stored(DatasetConfig(format="ros", expert=topics), path).frames
+    np.testing.assert_array_equal(frames.colour(1), np.repeat(shots()[1].colour[..., :1], 3, axis=2))
+    np.testing.assert_array_equal(frames.depth(1), shots()[1].depth_mm // 2)
+    with pytest.raises(ConfigError, match=r"no images of topic '/depth' .*aligned_depth_to_color"):
+        open_stored(DatasetConfig(format="ros", expert=DatasetExpert(depth_topic="/depth")), path)
 
 
 DAMAGES = [(case, name) for case in CASES for name in case.damages]

@@ -14,6 +14,7 @@ from tgslam.datasets.layouts.open3d_recording import OPEN3D
 from tgslam.datasets.layouts.polycam import POLYCAM
 from tgslam.datasets.layouts.record3d import RECORD3D
 from tgslam.datasets.layouts.replica import REPLICA
+from tgslam.datasets.layouts.ros_bag import ROS
 from tgslam.datasets.layouts.scannet import SCANNET
 from tgslam.datasets.layouts.scannetpp import SCANNETPP
 from tgslam.datasets.layouts.sens_file import SENS
@@ -23,7 +24,7 @@ from tgslam.datasets.tum import TUM
 
 LAYOUTS: tuple[Layout, ...] = (
     FOLDER, BONN, TUM, ICL, REPLICA, BUNDLE_FUSION, SEVEN_SCENES, TARTANAIR, SENS, SCANNET, SCANNETPP, NERFSTUDIO,
-    RECORD3D, POLYCAM, OPEN3D,
+    RECORD3D, POLYCAM, OPEN3D, ROS,
 )  # fmt: skip
 
 
