@@ -42,6 +42,7 @@ class FolderSource:
             if calibration.distortion
             else None
         )
+        self._told_size = False  # that depth is of another one
         self._resampler = _resampler(recording, self._stored)
         self._resizer = None if config.width in (0, width) else Resizer(self._stored, config.width, recording.name)
 
@@ -87,8 +88,9 @@ class FolderSource:
         """Colour and depth, pixel for pixel, without distortion, as the stored images have their rows."""
         self._check_sizes(index, rgb.shape[:2], raw.shape)
         if self._resampler is None and raw.shape != rgb.shape[:2]:
-            if index == 0:
-                _log.info("%s: depth is %dx%d and is enlarged to colour's size", self.name, raw.shape[1], raw.shape[0])
+            if not self._told_size:
+                self._told_size = True
+                _log.info("%s: depth is %dx%d, and is brought to colour's size", self.name, raw.shape[1], raw.shape[0])
             raw = same_view(raw.shape, rgb.shape[:2])(raw)
         if self._undistorter is not None:
             rgb = self._undistorter.colour(rgb)

@@ -76,7 +76,7 @@ class DepthResampler:
 
 
 class Resizer:
-    """Makes images smaller: colour is averaged over the pixels that fall together, depth is the nearest pixel's."""
+    """Makes images smaller: colour is averaged over the pixels that fall together, depth is looked up in between."""
 
     def __init__(self, stored: Camera, width: int, name: str) -> None:
         """Raises ConfigError for a width beyond that of the stored images."""
@@ -95,6 +95,7 @@ class Resizer:
             cx=(stored.cx + 0.5) * across - 0.5,
             cy=(stored.cy + 0.5) * down - 0.5,
         )
+        self._resampling = same_view(stored.shape, self.camera.shape)
 
     def colour(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """[H, W, 3] -> of the camera's size."""
@@ -102,8 +103,4 @@ class Resizer:
 
     def depth(self, raw: NDArray[Any]) -> NDArray[Any]:
         """[H, W] -> of the camera's size."""
-        rows, columns = (
-            np.minimum(((np.arange(new) + 0.5) * old / new).astype(int), old - 1)
-            for new, old in zip(self.camera.shape, raw.shape, strict=True)
-        )
-        return raw[rows][:, columns]
+        return self._resampling(raw)
