@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import zipfile
 from pathlib import Path
@@ -14,7 +15,8 @@ from tests.recordings.folders import BONN, FOLDER, OPEN3D, REDWOOD
 from tests.recordings.kinect import BUNDLE_FUSION, SCANNET, SCENES_MOTION, SENS, SEVEN_SCENES
 from tests.recordings.phones import NERFSTUDIO, POLYCAM, RECORD3D, SCANNETPP, record3d_members, write_zip
 from tests.recordings.rendered import REPLICA, TARTANAIR_V1, TARTANAIR_V2
-from tests.recordings.shots import Case, shots
+from tests.recordings.shots import Case, shots, write_image
+from tests.test_layers import CHECKOUT
 from tgslam.config.input_settings import FOLDER_FORMATS, DatasetConfig, DatasetExpert, SyntheticConfig
 from tgslam.datasets import RgbdSource, open_source, open_stored
 from tgslam.datasets.detection import told_format
@@ -22,6 +24,7 @@ from tgslam.datasets.formats import LAYOUTS
 from tgslam.errors import ConfigError, FrameError, TgslamError
 from tgslam.geometry import inverse
 from tgslam.types import Trajectory
+from tools.markdown_block import blocks
 
 REGISTERED = [
     REPLICA, TARTANAIR_V1, TARTANAIR_V2, BUNDLE_FUSION, SCANNET, SENS, OPEN3D, REDWOOD, BONN, FOLDER, NERFSTUDIO,
@@ -112,7 +115,8 @@ def test_damage_is_said_in_one_line_that_names_the_file(case: Case, name: str, t
 
 
 def test_every_layout_is_a_format_and_has_three_damages() -> None:
-    assert {layout.name for layout in LAYOUTS} <= set(FOLDER_FORMATS)
+    assert {layout.name for layout in LAYOUTS} == set(FOLDER_FORMATS)
+    assert {case.format for case in CASES} == set(FOLDER_FORMATS) - {"tum", "icl"}  # test_datasets.py has these
     assert all(len(case.damages) >= 3 for case in CASES)
 
 
@@ -138,3 +142,21 @@ def test_an_unpacked_record3d_is_read_too(tmp_path: Path) -> None:
     source = opened(RECORD3D, tmp_path / "room")
     np.testing.assert_allclose(source.read(2).depth_m, shots()[2].depth_m, atol=1e-6)
     check_poses(RECORD3D, source.groundtruth())
+
+
+PAGE = CHECKOUT / "docs" / "recordings.md"
+
+
+def test_the_page_on_recordings_has_every_layout_in_order() -> None:
+    rows = re.findall(r"^\| `(\w+)` \|", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert rows == [layout.name for layout in LAYOUTS]
+
+
+def test_the_description_in_the_page_is_read(tmp_path: Path) -> None:
+    (text,) = blocks(PAGE.read_text(encoding="utf-8"), "yaml")
+    (tmp_path / "recording.yaml").write_text(text)
+    write_image(tmp_path / "left/7.5.png", shots(640, 480)[0].colour)
+    write_image(tmp_path / "depth/7.51.tiff", shots(640, 480)[0].depth_m)
+    stored = open_stored(DatasetConfig(format="folder"), tmp_path)
+    assert stored.frames.times_s == [7.5] and stored.calibration.fx == 525.0
+    assert stored.depth_camera is not None and stored.depth_camera.is_concentric
