@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from tests.recordings.bags import MCAP, MOTION, REALSENSE, ROS1, ROS2
-from tests.recordings.folders import BONN, FOLDER, OPEN3D, REDWOOD
+from tests.recordings.folders import BONN, FOLDER, OPEN3D, REDWOOD, TUM
 from tests.recordings.kinect import BUNDLE_FUSION, SCANNET, SCENES_MOTION, SENS, SEVEN_SCENES
 from tests.recordings.phones import NERFSTUDIO, POLYCAM, RECORD3D, SCANNETPP, record3d_members, write_zip
 from tests.recordings.rendered import REPLICA, TARTANAIR_V1, TARTANAIR_V2
-from tests.recordings.shots import Case, shots, write_image
+from tests.recordings.shots import Case, shots, write_image, write_json
 from tests.test_layers import CHECKOUT
 from tgslam.config.input_settings import FOLDER_FORMATS, DatasetConfig, DatasetExpert, SyntheticConfig
 from tgslam.datasets import RgbdSource, open_source, open_stored
@@ -27,7 +27,7 @@ from tgslam.types import Trajectory
 from tools.markdown_block import blocks
 
 REGISTERED = [
-    REPLICA, TARTANAIR_V1, TARTANAIR_V2, BUNDLE_FUSION, SCANNET, SENS, OPEN3D, REDWOOD, BONN, FOLDER, NERFSTUDIO,
+    REPLICA, TARTANAIR_V1, TARTANAIR_V2, BUNDLE_FUSION, SCANNET, SENS, OPEN3D, REDWOOD, BONN, TUM, FOLDER, NERFSTUDIO,
     SCANNETPP, RECORD3D, POLYCAM, ROS1, ROS2, MCAP,
 ]  # fmt: skip
 CASES = [*REGISTERED, SEVEN_SCENES]
@@ -76,6 +76,13 @@ def test_seven_scenes_has_a_depth_camera_of_its_own(tmp_path: Path) -> None:
     check_poses(SEVEN_SCENES, stored.poses())
 
 
+def test_a_camera_that_cannot_be_is_said_with_the_recording(tmp_path: Path) -> None:
+    path = REPLICA.write(tmp_path)
+    write_json(tmp_path / "cam_params.json", {"camera": {"w": 32, "h": 24, "fx": -1, "fy": 1, "cx": 1, "cy": 1}})
+    with pytest.raises(ConfigError, match=r"room0: dataset\.fx is -1"):
+        opened(REPLICA, path)
+
+
 def test_realsense_has_a_depth_camera_of_its_own_and_its_units(tmp_path: Path) -> None:
     stored = open_stored(DatasetConfig(format="ros"), REALSENSE.write(tmp_path))
     assert stored.depth_camera is not None and stored.depth_units == pytest.approx(10_000.0)
@@ -116,7 +123,7 @@ def test_damage_is_said_in_one_line_that_names_the_file(case: Case, name: str, t
 
 def test_every_layout_is_a_format_and_has_three_damages() -> None:
     assert {layout.name for layout in LAYOUTS} == set(FOLDER_FORMATS)
-    assert {case.format for case in CASES} == set(FOLDER_FORMATS) - {"tum", "icl"}  # test_datasets.py has these
+    assert {case.format for case in CASES} == set(FOLDER_FORMATS) - {"icl"}  # test_datasets.py has it
     assert all(len(case.damages) >= 3 for case in CASES)
 
 

@@ -11,6 +11,7 @@ from tests.recordings.shots import (
     FY,
     OPENGL,
     Case,
+    Damage,
     H,
     K,
     W,
@@ -23,6 +24,7 @@ from tests.recordings.shots import (
 from tgslam.geometry import quat_wxyz_from_matrix
 
 TIMES = (5.0, 5.04, 5.08)
+INTRINSICS = {"fx": FX, "fy": FY, "cx": CX, "cy": CY}
 
 
 def tum_row(time_s: float, T: object) -> str:
@@ -44,8 +46,8 @@ def write_open3d(folder: Path, colour: str = "color", names: str = "{0:05}") -> 
     return folder
 
 
-def write_bonn(folder: Path) -> Path:
-    sequence = folder / "rgbd_bonn_balloon"
+def write_lists(sequence: Path) -> Path:
+    """As the TUM benchmark does."""
     lists = {"rgb": "", "depth": "", "groundtruth": ""}
     for shot, time_s in zip(shots(), TIMES, strict=True):
         write_image(sequence / f"rgb/{time_s:.5f}.png", shot.colour)
@@ -58,6 +60,11 @@ def write_bonn(folder: Path) -> Path:
     return sequence
 
 
+LISTS_DAMAGES: dict[str, Damage] = {
+    "list": (lambda path: (path / "rgb.txt").write_text("5.0\n"), r"rgb\.txt:1: expected 'timestamp file'"),
+    "poses": (lambda path: spoil(path / "groundtruth.txt"), r"groundtruth\.txt:1: expected 8 numbers"),
+    "image": (lambda path: truncate(path / "depth/5.04000.png"), r"5\.04000\.png: .*truncated"),
+}
 DESCRIPTION = f"""\
 colour: left images/*.png
 depth: depth/*.tiff
@@ -112,17 +119,8 @@ REDWOOD = Case(
     times_s=(0.0, 0.04, 0.08),
     name="redwood",
 )
-BONN = Case(
-    "bonn",
-    write_bonn,
-    {
-        "list": (lambda path: (path / "rgb.txt").write_text("5.0\n"), r"rgb\.txt:1: expected 'timestamp file'"),
-        "poses": (lambda path: spoil(path / "groundtruth.txt"), r"groundtruth\.txt:1: expected 8 numbers"),
-        "image": (lambda path: truncate(path / "depth/5.04000.png"), r"5\.04000\.png: .*truncated"),
-    },
-    {"fx": FX, "fy": FY, "cx": CX, "cy": CY},
-    times_s=TIMES,
-)
+BONN = Case("bonn", lambda folder: write_lists(folder / "rgbd_bonn_balloon"), LISTS_DAMAGES, INTRINSICS, times_s=TIMES)
+TUM = Case("tum", lambda folder: write_lists(folder / "clip"), LISTS_DAMAGES, INTRINSICS, times_s=TIMES)
 FOLDER = Case(
     "folder",
     write_described,

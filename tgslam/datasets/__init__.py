@@ -39,5 +39,7 @@ def open_stored(config: DatasetConfig, path: Path | None) -> StoredRecording:
         raise DatasetError(f"{path}: {'not a folder' if path.exists() else 'no such folder'}; check --input")
     try:
         return layout.open(path, config)
+    except ConfigError as error:
+        raise error if str(path) in str(error) else ConfigError(f"{path}: {error}") from error
     except OSError as cause:
         raise DatasetError(f"{cause.filename or path}: cannot be read ({cause.strerror or cause})") from cause
