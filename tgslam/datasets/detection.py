@@ -47,6 +47,7 @@ def guess_format(path: Path) -> str:
     if layout is None:
         raise ConfigError(
             f"{path}: what is in it is like no recording that is known, so its format is not known; name one with "
-            "--format, or describe the folder in a recording.yaml (docs/recordings.md)"
+            "--format or a config such as configs/tum.yaml, or describe the folder in a recording.yaml "
+            "(docs/recordings.md)"
         )
     return layout.name
