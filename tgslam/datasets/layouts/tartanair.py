@@ -7,6 +7,7 @@ right, y down, z forward. Images are 640x480 in V1 and 640x640 in V2, 90 degrees
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -46,7 +47,8 @@ def open_tartanair(folder: Path, config: DatasetConfig) -> StoredRecording:
     version = _version(folder) or _VERSIONS[0]
     pairs = _pairs(folder, version.camera)
     frames = ImageFrames(at_usual_rate(pairs), read_depth)
-    name = "-".join(part for part in folder.resolve().parts[-3:] if part.strip("/"))
+    parts = folder.resolve().parts
+    name = "-".join(parts[-3:] if re.fullmatch(r"P\d+", parts[-1]) else parts[-1:])
     poses = partial(_poses, folder / f"pose_{version.camera}.txt", pairs)
     return StoredRecording(name, frames, resolve(config, version.calibration, ""), _DEPTH_UNITS, poses)
 
