@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 import sys
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.recordings.bags import MCAP, MOTION, REALSENSE, ROS1, ROS2
-from tests.recordings.folders import BONN, FOLDER, OPEN3D, REDWOOD, TUM
+from tests.recordings.folders import BONN, FOLDER, OPEN3D, REDWOOD, TIMES, TUM
 from tests.recordings.kinect import BUNDLE_FUSION, SCANNET, SCENES_MOTION, SENS, SEVEN_SCENES
 from tests.recordings.phones import NERFSTUDIO, POLYCAM, RECORD3D, SCANNETPP, record3d_members, write_zip
 from tests.recordings.rendered import REPLICA, TARTANAIR_V1, TARTANAIR_V2
@@ -149,6 +150,22 @@ def test_an_unpacked_record3d_is_read_too(tmp_path: Path) -> None:
     source = opened(RECORD3D, tmp_path / "room")
     np.testing.assert_allclose(source.read(2).depth_m, shots()[2].depth_m, atol=1e-6)
     check_poses(RECORD3D, source.groundtruth())
+
+
+@pytest.mark.parametrize("names", ["{0:.2f}", "{1}"])
+def test_folders_of_colour_and_depth_need_a_camera_only(tmp_path: Path, names: str) -> None:
+    for k, shot in enumerate(shots()):
+        name = names.format(TIMES[k], 9 + k)
+        write_image(tmp_path / f"color/{name}.png", shot.colour)
+        write_image(tmp_path / f"depth/{name}.png", shot.depth_mm)
+    (tmp_path / "color/notes.txt").write_text("none")
+    plain = replace(FOLDER, settings={"fx": 30.0, "fy": 31.0, "cx": 15.0, "cy": 11.5})
+    source = opened(plain, tmp_path)
+    assert source.read(2).timestamp_s == pytest.approx(TIMES[2] if "." in names else 2 / 30)
+    np.testing.assert_allclose(source.read(2).colour, shots()[2].colour / 255.0, atol=1e-6)
+    np.testing.assert_allclose(source.read(2).depth_m, shots()[2].depth_m, atol=1e-6)
+    with pytest.raises(ConfigError, match=r"the camera is not known: set dataset\.fx.*recording\.yaml a camera"):
+        opened(FOLDER, tmp_path)
 
 
 PAGE = CHECKOUT / "docs" / "recordings.md"

@@ -8,7 +8,7 @@ from tgslam.datasets.icl import ICL
 from tgslam.datasets.layout import Layout
 from tgslam.datasets.layouts.bonn import BONN
 from tgslam.datasets.layouts.bundle_fusion import BUNDLE_FUSION
-from tgslam.datasets.layouts.described import FOLDER
+from tgslam.datasets.layouts.described import FOLDER, plain_folder
 from tgslam.datasets.layouts.nerfstudio import NERFSTUDIO
 from tgslam.datasets.layouts.open3d_recording import OPEN3D
 from tgslam.datasets.layouts.polycam import POLYCAM
@@ -37,4 +37,7 @@ def layout_of(path: Path) -> Layout | None:
     """The layout that a folder or file, which exists, looks like."""
     is_file = path.is_file()
     candidates = (layout for layout in LAYOUTS if layout.is_file or not is_file)
-    return next((layout for layout in candidates if layout.recognises(path)), None)
+    found = next((layout for layout in candidates if layout.recognises(path)), None)
+    if found is None and all(plain_folder(path, kind) for kind in ("colour", "depth")):
+        return FOLDER
+    return found

@@ -1,8 +1,13 @@
-"""Any folder of colour and depth images, with a recording.yaml that says what they are; see docs/recordings.md."""
+"""Any folder of colour and depth images, with a recording.yaml that says what they are; see docs/recordings.md.
+
+Without that file, folders called rgb, color, colour, image or images, and depth or depths, hold the images, and the
+settings have to give the camera.
+"""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +19,7 @@ from tgslam.config.yaml_text import YamlTextError, parse_yaml
 from tgslam.datasets.calibration import Calibration, DepthCamera, resolve
 from tgslam.datasets.groundtruth import read_groundtruth
 from tgslam.datasets.layout import Layout
-from tgslam.datasets.listing import USUAL_RATE_HZ, natural_order
+from tgslam.datasets.listing import DEPTH_SUFFIXES, IMAGE_SUFFIXES, USUAL_RATE_HZ, natural_order
 from tgslam.datasets.lists import ImagePair
 from tgslam.datasets.named_files import named_file
 from tgslam.datasets.pose_rows import OPENGL_CAMERA, read_numbers, turned
@@ -26,14 +31,18 @@ from tgslam.types import Trajectory
 DESCRIPTION = "recording.yaml"
 _KEYS = {"colour", "depth", "depth_scale", "camera", "depth_camera", "rate", "times", "poses", "axes"}
 _CAMERA_KEYS = {"fx", "fy", "cx", "cy", "distortion", "width", "height", "T_colour_depth"}
+_PLAIN = {"colour": ("rgb", "color", "colour", "image", "images"), "depth": ("depth", "depths")}
+_TIME = re.compile(r"\d+\.\d+")
 _AXES = {"opencv": np.eye(4), "opengl": OPENGL_CAMERA}
 
 
 def open_described(folder: Path, config: DatasetConfig) -> StoredRecording:
-    """A folder with recording.yaml. Raises ConfigError for what it says, DatasetError for missing images."""
+    """A folder. Raises ConfigError for what its recording.yaml says, DatasetError for missing images."""
     path = folder / DESCRIPTION
-    said = _read(path)
-    colour, depth = (_images(folder, said.get(key), key, path) for key in ("colour", "depth"))
+    said = _read(path) if path.is_file() else {}
+    colour, depth = (_images(folder, said, kind, path) for kind in ("colour", "depth"))
+    if not said and all(_TIME.fullmatch(file.stem) for file in (*colour, *depth)):
+        said = {"times": "names"}
     pairs = _pairs(colour, depth, said, config.expert.depth_tolerance_s, path)
     frames = ImageFrames(pairs)
     camera = said.get("camera")
@@ -54,6 +63,8 @@ def _read(path: Path) -> dict[str, Any]:
     except (UnicodeDecodeError, YamlTextError) as cause:
         line = getattr(cause, "line", None)
         raise ConfigError(f"{path}{'' if line is None else f':{line}'}: {cause}") from cause
+    if isinstance(said, dict) and "color" in said:
+        said["colour"] = said.pop("color")
     return _mapping(said, _KEYS, str(path))
 
 
@@ -66,8 +77,11 @@ def _mapping(value: object, keys: set[str], name: str) -> dict[str, Any]:
     return {str(key): item for key, item in value.items()}
 
 
-def _images(folder: Path, pattern: object, key: str, path: Path) -> list[Path]:
+def _images(folder: Path, said: dict[str, Any], key: str, path: Path) -> list[Path]:
     """Files that a glob pattern such as rgb/*.png finds, in the order of their names."""
+    pattern = said.get(key)
+    if not said:
+        return _plain_images(folder, key)
     if not isinstance(pattern, str):
         raise ConfigError(f"{path}: {key} must be a pattern of file names, such as {key}/*.png")
     named_file(folder, pattern, f"{path}: {key}")
@@ -78,6 +92,23 @@ def _images(folder: Path, pattern: object, key: str, path: Path) -> list[Path]:
     if not found:
         raise DatasetError(f"{path}: {key}: no file matches {pattern!r}")
     return sorted(found, key=lambda file: natural_order(file.relative_to(folder).as_posix()))
+
+
+def _plain_images(folder: Path, kind: str) -> list[Path]:
+    """Images of the folder that is called as one of this kind."""
+    place, suffixes = plain_folder(folder, kind), IMAGE_SUFFIXES if kind == "colour" else DEPTH_SUFFIXES
+    files = [] if place is None else [file for file in place.iterdir() if file.suffix.lower() in suffixes]
+    if not files:
+        raise DatasetError(
+            f"{folder}: found no {kind} images in a folder {' or '.join(_PLAIN[kind])}; a {DESCRIPTION} may say where "
+            "they are"
+        )
+    return sorted(files, key=lambda file: natural_order(file.name))
+
+
+def plain_folder(folder: Path, kind: str) -> Path | None:
+    """The folder within `folder` that is called as one of images of this kind, "colour" or "depth"."""
+    return next((folder / name for name in _PLAIN[kind] if (folder / name).is_dir()), None)
 
 
 def _pairs(
