@@ -72,6 +72,59 @@ def test_depth_in_floats_is_in_metres_whatever_the_scale(folder: Path) -> None:
         check_frames(folder)
 
 
+def exr_file(channels: dict[str, np.ndarray], compression: int) -> bytes:
+    """Floats of 32 or 16 bits in scan lines, in the order of the channels' names; 0 = no compression, 3 = ZIP."""
+    height, width = next(iter(channels.values())).shape
+    kinds = {np.dtype("<f4"): 2, np.dtype("<f2"): 1}
+    listed = b"".join(
+        name.encode() + b"\0" + struct.pack("<iIii", kinds[array.dtype], 0, 1, 1) for name, array in channels.items()
+    )
+    window = struct.pack("<4i", 5, 7, width + 4, height + 6)
+    values = {"channels": ("chlist", listed + b"\0"), "compression": ("compression", bytes([compression]))}
+    values |= {"dataWindow": ("box2i", window), "displayWindow": ("box2i", window), "lineOrder": ("lineOrder", b"\0")}
+    head = b"v/1\x01\x02\0\0\0"
+    for key, (kind, value) in values.items():
+        head += key.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<I", len(value)) + value
+    step, blocks = 16 if compression else 1, []
+    for top in range(0, height, step):
+        rows = range(top, min(top + step, height))
+        raw = b"".join(channels[name][row].tobytes() for row in rows for name in channels)
+        blocks.append(struct.pack("<i", top + 7) + packed(raw, compression))
+    offsets, at = b"", len(head) + 1 + 8 * len(blocks)
+    for block in blocks:
+        offsets, at = offsets + struct.pack("<Q", at), at + len(block)
+    return head + b"\0" + offsets + b"".join(blocks)
+
+
+def packed(raw: bytes, compression: int) -> bytes:
+    if compression:
+        split = np.frombuffer(raw[0::2] + raw[1::2], np.uint8).astype(int)
+        split[1:] = (np.diff(split) + 128) % 256
+        raw = zlib.compress(split.astype(np.uint8).tobytes())
+    return struct.pack("<i", len(raw)) + raw
+
+
+@pytest.mark.parametrize("compression", [0, 3])
+@pytest.mark.parametrize("names", [["Z"], ["A", "V"], ["B", "G", "R"]])
+def test_depth_in_exr(folder: Path, compression: int, names: list[str]) -> None:
+    for shot, time_s in zip(shots(), TIMES, strict=True):
+        other = np.full((H, W), 7, np.float16)
+        channels = dict.fromkeys(names[:-1], other) | {names[-1]: shot.depth_m}
+        (folder / f"depth/{time_s:.2f}.exr").write_bytes(exr_file(channels, compression))
+    write_list(folder, "depth", "{t:.2f} depth/{t:.2f}.exr")
+    check_frames(folder)
+
+
+def test_depth_in_exr_that_is_not_read_is_said_at_once(folder: Path) -> None:
+    for time_s in TIMES:
+        data = bytearray(exr_file({"Z": shots()[0].depth_m}, 0))
+        data[data.index(b"compression\0compression\0") + 28] = 4
+        (folder / f"depth/{time_s:.2f}.exr").write_bytes(data)
+    write_list(folder, "depth", "{t:.2f} depth/{t:.2f}.exr")
+    with pytest.raises(DatasetError, match=r"5\.00\.exr: not an EXR that can be read \(compression 4\).* TIFF or NPY"):
+        opened(folder)
+
+
 def test_float_depth_that_is_no_metres_is_said(folder: Path) -> None:
     np.save(folder / "depth/5.04.npy", shots()[1].depth_mm.astype(np.float32))
     write_list(folder, "depth", "{t:.2f} depth/5.04.npy")

@@ -20,17 +20,19 @@ from tgslam.pixels import colour_as_float
 from tgslam.types import Frame, Trajectory
 
 _log = logging.getLogger(__name__)
+_SAMPLE_IMAGES = 8  # of a recording
 
 
 class FolderSource:
     """RGB-D frames from a recording on disk; it keeps where they are and nothing else of them."""
 
     def __init__(self, recording: StoredRecording, config: DatasetConfig) -> None:
-        """Reads colour images until one tells the image size.
+        """Reads colour images until one tells the image size, and depth until one can be read.
 
-        Raises DatasetError if there is none, and ConfigError if the calibration is for images of another size.
+        Raises DatasetError if there is none of either, and ConfigError if the calibration is for another size.
         """
         width, height = _image_size(recording.name, recording.frames)
+        _require_depth(recording.name, recording.frames)
         calibration = recording.calibration
         check_size(calibration, width, height, recording.name)
         self._recording, self._config = recording, config
@@ -140,6 +142,20 @@ def _resampler(recording: StoredRecording, camera: Camera) -> DepthResampler | N
             recording.name,
         )
     return DepthResampler(depth_camera.calibration, camera)
+
+
+def _require_depth(name: str, frames: StoredFrames) -> None:
+    """Raise DatasetError if none of a few depth images, from all over the recording, can be read."""
+    count = len(frames.times_s)
+    first_error = ""
+    for index in range(0, count, max(1, count // _SAMPLE_IMAGES)):
+        try:
+            frames.depth(index)
+        except FrameError as error:
+            first_error = first_error or str(error)
+        else:
+            return
+    raise DatasetError(f"{name}: its depth images cannot be read; the first: {first_error}")
 
 
 def _image_size(name: str, frames: StoredFrames) -> tuple[int, int]:

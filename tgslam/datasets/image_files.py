@@ -6,7 +6,6 @@ import contextlib
 import io
 import logging
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,13 +14,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam.datasets import exr
 from tgslam.datasets.image_header import MOST_PIXELS, check_claimed_size
 from tgslam.errors import DatasetError, FrameError
 from tgslam.pixels import depth_as_metres
 from tgslam.types import FloatImage
 
 _PNG_START, _PNG_END = b"\x89PNG", b"IEND"
-_NPY_START, _EXR_START = b"\x93NUMPY", b"v/1\x01"
+_NPY_START = b"\x93NUMPY"
 _SAMPLE_IMAGES = 4  # of a recording, that tell its colours' range
 _MOST_BYTES = 1 << 30  # of an image file
 _log = logging.getLogger(__name__)
@@ -79,7 +79,12 @@ def read_raw_depth(path: Path) -> NDArray[Any]:
 
 def decode_raw_depth(data: bytes, name: str) -> NDArray[Any]:
     """The bytes of a depth file; see `read_raw_depth`. name: for messages."""
-    raw = _decode_npy(data, name) if data.startswith(_NPY_START) else _decode_depth_image(data, name)
+    if data.startswith(_NPY_START):
+        raw = _decode_npy(data, name)
+    elif data.startswith(exr.START):
+        raw = _decode_exr(data, name)
+    else:
+        raw = _decode(data, name, cv2.IMREAD_UNCHANGED)
     if raw.ndim == 3 and raw.shape[2] == 1:
         raw = raw[..., 0]
     if raw.ndim != 2:
@@ -90,7 +95,7 @@ def decode_raw_depth(data: bytes, name: str) -> NDArray[Any]:
     if raw.dtype != np.uint16:
         raise FrameError(
             f"{name}: a depth image has 16 bits, this has {8 * raw.itemsize}; export depth as 16-bit PNG, or as floats "
-            "in metres (TIFF, NPY)"
+            "in metres (TIFF, EXR, NPY)"
         )
     return raw
 
@@ -168,14 +173,9 @@ def _decode(data: bytes, name: str, flags: int) -> NDArray[Any]:
     return image
 
 
-def _decode_depth_image(data: bytes, name: str) -> NDArray[Any]:
-    if not data.startswith(_EXR_START):
-        return _decode(data, name, cv2.IMREAD_UNCHANGED)
-    os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")  # OpenCV asks before it reads its first one
-    try:
-        return _decode(data, name, cv2.IMREAD_UNCHANGED)
-    except FrameError as error:
-        raise FrameError(f"{error}; OpenCV as installed may read no EXR: store depth as TIFF or NPY") from error
+def _decode_exr(data: bytes, name: str) -> NDArray[Any]:
+    check_claimed_size(data, name)
+    return exr.decode_exr_depth(data, name)
 
 
 def _decode_npy(data: bytes, name: str) -> NDArray[Any]:
