@@ -37,7 +37,8 @@ def write_open3d(folder: Path, colour: str = "color", names: str = "{0:05}") -> 
     for shot in shots():
         name = names.format(shot.number, 40_000 * shot.number)
         write_image(folder / f"{colour}/{name}.jpg", shot.colour)
-        write_image(folder / f"depth/{name}.png", shot.depth_mm)
+        depth_name = names.format(shot.number + 1, 40_000 * shot.number + 7000)  # Redwood's go by times
+        write_image(folder / f"depth/{depth_name if '-' in name else name}.png", shot.depth_mm)
         log.append(f"{shot.number} {shot.number} {shot.number + 1}")
         log += [" ".join(f"{x:.9f}" for x in row) for row in shot.T_wc]
     (folder / "trajectory.log").write_text("\n".join(log) + "\n")

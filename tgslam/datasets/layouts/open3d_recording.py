@@ -14,15 +14,17 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tgslam.config.input_settings import DatasetConfig
 from tgslam.datasets import json_files
 from tgslam.datasets.calibration import Calibration, of_matrix, resolve
 from tgslam.datasets.layout import Layout
-from tgslam.datasets.listing import Numbered, at_usual_rate, numbered_files, pairs_by_number
+from tgslam.datasets.listing import at_usual_rate, numbered_files, pairs_by_number
 from tgslam.datasets.lists import ImagePair
 from tgslam.datasets.pose_rows import read_numbers, trajectory_of_matrices
 from tgslam.datasets.stored import MILLIMETRES, ImageFrames, StoredRecording
+from tgslam.datasets.time_matching import associate_times
 from tgslam.errors import DatasetError
 from tgslam.types import Trajectory
 
@@ -38,7 +40,7 @@ def open_open3d(folder: Path, config: DatasetConfig) -> StoredRecording:
     """A recording's folder. Raises DatasetError for missing images or a damaged camera file."""
     colour_folder = _colour_folder(folder) or folder / _COLOUR_FOLDERS[0]
     colour, depth = numbered_files(colour_folder, _COLOUR), numbered_files(folder / "depth", _DEPTH)
-    pairs = _timed(pairs_by_number(colour, depth, folder, "color/00000.jpg and depth/00000.png"))
+    pairs = _pairs(folder, colour, depth, config.expert.depth_tolerance_s)
     camera_file = _camera_file(folder)
     calibration = _PRIMESENSE if camera_file is None else _calibration(camera_file)
     frames = ImageFrames(pairs)
@@ -46,13 +48,24 @@ def open_open3d(folder: Path, config: DatasetConfig) -> StoredRecording:
     return StoredRecording(folder.resolve().name, frames, resolve(config, calibration, ""), MILLIMETRES, poses)
 
 
-def _timed(files: list[Numbered]) -> list[ImagePair]:
-    """At the times in the files' names if all have one, else at the usual rate."""
-    found = [_REDWOOD.match(file.colour.name) for file in files]
-    times_s = [int(match[1]) * 1e-6 for match in found if match]
-    if len(times_s) < len(files) or not (np.diff(times_s) > 0).all():
+def _pairs(folder: Path, colour: dict[int, Path], depth: dict[int, Path], tolerance_s: float) -> list[ImagePair]:
+    """By the times in the files' names, as Redwood has them; else by number, at the usual rate."""
+    files = pairs_by_number(colour, depth, folder, "color/00000.jpg and depth/00000.png")
+    colour_s, depth_s = _times_s(colour), _times_s(depth)
+    if colour_s is None or depth_s is None:
         return at_usual_rate(file._replace(number=place) for place, file in enumerate(files))
-    return [ImagePair(time_s, file.colour, file.depth) for time_s, file in zip(times_s, files, strict=True)]
+    i, j = associate_times(colour_s, depth_s, tolerance_s)
+    if not len(i):
+        raise DatasetError(f"{folder}: no depth image is within {tolerance_s:g} s of a colour image, by their names")
+    images = list(colour.values()), list(depth.values())
+    return [ImagePair(float(colour_s[a]), images[0][a], images[1][b]) for a, b in zip(i, j, strict=True)]
+
+
+def _times_s(images: dict[int, Path]) -> NDArray[np.float64] | None:
+    """Of images in order; None where the names do not tell."""
+    found = [_REDWOOD.match(path.name) for path in images.values()]
+    times_s = np.array([int(match[1]) for match in found if match]) * 1e-6
+    return times_s if len(times_s) == len(images) and (np.diff(times_s) > 0).all() else None
 
 
 def _calibration(path: Path) -> Calibration:
