@@ -77,6 +77,14 @@ def test_seven_scenes_has_a_depth_camera_of_its_own(tmp_path: Path) -> None:
     check_poses(SEVEN_SCENES, stored.poses())
 
 
+def test_depth_of_instant_ngp_has_units_of_its_own(tmp_path: Path) -> None:
+    path = NERFSTUDIO.write(tmp_path)
+    text = (path / "transforms.json").read_text().replace("depth_file_path", "depth_path")
+    (path / "transforms.json").write_text(text.replace('"k1"', '"integer_depth_scale": 0.0005, "k1"'))
+    source = opened(NERFSTUDIO, path)
+    np.testing.assert_allclose(source.read(1).depth_m, shots()[1].depth_m / 2, atol=1e-6)
+
+
 def test_a_camera_that_cannot_be_is_said_with_the_recording(tmp_path: Path) -> None:
     path = REPLICA.write(tmp_path)
     write_json(tmp_path / "cam_params.json", {"camera": {"w": 32, "h": 24, "fx": -1, "fy": 1, "cx": 1, "cy": 1}})

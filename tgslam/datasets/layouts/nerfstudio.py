@@ -1,6 +1,7 @@
-"""nerfstudio's transforms.json with depth_file_path.
+"""transforms.json of nerfstudio, with depth_file_path, or of instant-ngp and NeRFCapture, with depth_path.
 
-Source: https://docs.nerf.studio/quickstart/data_conventions.html. Whole-number depth is in millimetres. Poses are
+Source: https://docs.nerf.studio/quickstart/data_conventions.html. Whole-number depth is in millimetres, or in units of
+integer_depth_scale metres where that stands in the file, as for https://github.com/NVlabs/instant-ngp. Poses are
 camera-to-world with the camera's y axis up and z axis back. Principal points count from the corner of the first pixel,
 ours from its centre, half a pixel further. Frames come in the order of their names, at 30 Hz.
 """
@@ -37,7 +38,7 @@ def open_nerfstudio(folder: Path, config: DatasetConfig) -> StoredRecording:
     frames = _frames_with_depth(described, path)
     pairs = []
     for place, frame in enumerate(frames):
-        colour, depth = (named_file(folder, frame[key], str(path)) for key in ("file_path", "depth_file_path"))
+        colour, depth = (named_file(folder, name, str(path)) for name in (frame["file_path"], _depth_name(frame)))
         pairs.append(ImagePair(place / USUAL_RATE_HZ, _with_suffix(colour), depth))
     stored = ImageFrames(pairs)
 
@@ -48,18 +49,24 @@ def open_nerfstudio(folder: Path, config: DatasetConfig) -> StoredRecording:
         return trajectory_of_matrices(stored.times_s, np.stack(T) @ OPENGL_CAMERA, str(path))
 
     calibration = resolve(config, _calibration(described, frames, path), "")
-    return StoredRecording(folder.resolve().name, stored, calibration, MILLIMETRES, poses)
+    unit_m = json_files.number(described, "integer_depth_scale", str(path), 1.0 / MILLIMETRES)
+    if unit_m <= 0:
+        raise DatasetError(f"{path}: integer_depth_scale is {unit_m:g}, but a unit of depth is above 0 m")
+    return StoredRecording(folder.resolve().name, stored, calibration, 1.0 / unit_m, poses)
 
 
 def _frames_with_depth(described: Mapping[str, Any], path: Path) -> list[dict[str, Any]]:
     frames = described.get("frames")
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise DatasetError(f"{path}: has no list of frames")
-    keys = ("file_path", "depth_file_path")
-    found = [frame for frame in frames if all(isinstance(frame.get(key), str) for key in keys)]
+    found = [f for f in frames if isinstance(f.get("file_path"), str) and isinstance(_depth_name(f), str)]
     if not found:
         raise DatasetError(f"{path}: none of its {len(frames)} frames has a depth_file_path; depth is needed")
     return sorted(found, key=lambda frame: natural_order(frame["file_path"]))
+
+
+def _depth_name(frame: Mapping[str, Any]) -> Any:
+    return frame.get("depth_file_path", frame.get("depth_path"))
 
 
 def _calibration(described: Mapping[str, Any], frames: list[dict[str, Any]], path: Path) -> Calibration:
