@@ -378,7 +378,7 @@ GROUNDTRUTHS = {
 
 @pytest.mark.parametrize("kind", GROUNDTRUTHS)
 def test_ground_truth_of_other_programs(folder: Path, kind: str) -> None:
-    (folder / "groundtruth.txt").write_text(GROUNDTRUTHS[kind] + "\n")
+    (folder / ("groundtruth.csv" if "CSV" in kind else "groundtruth.txt")).write_text(GROUNDTRUTHS[kind] + "\n")
     truth = opened(folder).groundtruth()
     assert truth is not None
     np.testing.assert_allclose(truth.timestamps_s, TIMES, atol=1e-6)

@@ -36,7 +36,7 @@ def decode_exr_depth(data: bytes, name: str) -> NDArray[np.float32]:
     try:
         header = _read_header(data)
         return _read_blocks(data, header)
-    except (struct.error, ValueError, KeyError, IndexError, zlib.error) as cause:
+    except (struct.error, ValueError, KeyError, IndexError, OverflowError, zlib.error) as cause:
         raise FrameError(
             f"{name}: not an EXR that can be read ({cause}); scan lines without compression or with ZIP are, or store "
             "depth as TIFF or NPY"

@@ -24,6 +24,12 @@ _KITTI, _TIMED_KITTI, _SQUARE, _EUROC = 12, 13, 16, 17  # numbers in a row
 _SCALAR_FIRST, _SCALAR_LAST = [0, 1, 2, 3, 5, 6, 7, 4], [0, 1, 2, 3, 4, 5, 6, 7]  # order of a quaternion in a row
 
 
+def groundtruth_file(folder: Path) -> Path:
+    """groundtruth.txt, or .csv, of a folder; of one without either, the former."""
+    names = ("groundtruth.txt", "groundtruth.csv")
+    return next((folder / name for name in names if (folder / name).exists()), folder / names[0])
+
+
 def poses_of_file(path: Path, times_s: Sequence[float]) -> Callable[[], Trajectory | None]:
     """Reads the ground truth when it is called; None without such a file. times_s: of the frames."""
     return partial(_read_if_there, path, times_s)

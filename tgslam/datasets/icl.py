@@ -14,7 +14,7 @@ from pathlib import Path
 
 from tgslam.config.input_settings import DatasetConfig
 from tgslam.datasets.calibration import Calibration, resolve
-from tgslam.datasets.groundtruth import poses_of_file
+from tgslam.datasets.groundtruth import groundtruth_file, poses_of_file
 from tgslam.datasets.layout import Layout
 from tgslam.datasets.lists import ASSOCIATION_FILES, find_association_file, has_image_numbers, pairs_from_associations
 from tgslam.datasets.stored import ImageFrames, StoredRecording
@@ -47,7 +47,7 @@ def open_icl(folder: Path, config: DatasetConfig) -> StoredRecording:
 
 def _groundtruth_file(folder: Path) -> Path:
     """Of a folder without any, the one that it could have."""
-    usual = folder / "groundtruth.txt"
+    usual = groundtruth_file(folder)
     found = sorted(folder.glob("*.gt.freiburg"))
     return found[0] if len(found) == 1 and not usual.exists() else usual
 

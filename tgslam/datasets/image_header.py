@@ -27,7 +27,7 @@ def claimed_size(data: bytes) -> tuple[int, int] | None:
         if data.startswith(start):
             try:
                 return reader(data)
-            except (struct.error, IndexError):
+            except (struct.error, IndexError, OverflowError):
                 return None
     return None
 

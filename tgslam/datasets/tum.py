@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tgslam.config.input_settings import DatasetConfig
 from tgslam.datasets.calibration import Calibration, resolve
-from tgslam.datasets.groundtruth import poses_of_file
+from tgslam.datasets.groundtruth import groundtruth_file, poses_of_file
 from tgslam.datasets.layout import Layout
 from tgslam.datasets.lists import (
     ASSOCIATION_FILES,
@@ -44,7 +44,7 @@ def open_tum(folder: Path, config: DatasetConfig) -> StoredRecording:
         "an ICL-NUIM folder needs dataset.format=icl",
     )
     frames = ImageFrames(pairs)
-    poses = poses_of_file(folder / "groundtruth.txt", frames.times_s)
+    poses = poses_of_file(groundtruth_file(folder), frames.times_s)
     return StoredRecording(folder.resolve().name, frames, calibration, DEPTH_UNITS, poses)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tgslam.config.input_settings import DatasetConfig
 from tgslam.datasets.calibration import Calibration, resolve
-from tgslam.datasets.groundtruth import poses_of_file
+from tgslam.datasets.groundtruth import groundtruth_file, poses_of_file
 from tgslam.datasets.layout import Layout
 from tgslam.datasets.stored import ImageFrames, StoredRecording
 from tgslam.datasets.tum import DEPTH_UNITS, TUM, image_pairs
@@ -21,7 +21,7 @@ _CALIBRATION = Calibration(542.822841, 542.576870, 315.593520, 237.756098, _DIST
 def open_bonn(folder: Path, config: DatasetConfig) -> StoredRecording:
     """A sequence's folder. Raises DatasetError for missing or unusable lists."""
     frames = ImageFrames(image_pairs(folder, config.expert.depth_tolerance_s))
-    poses = poses_of_file(folder / "groundtruth.txt", frames.times_s)
+    poses = poses_of_file(groundtruth_file(folder), frames.times_s)
     return StoredRecording(folder.resolve().name, frames, resolve(config, _CALIBRATION, ""), DEPTH_UNITS, poses)
 
 
