@@ -12,7 +12,7 @@ from tgslam.camera import Camera
 from tgslam.config.input_settings import DatasetConfig
 from tgslam.datasets import image_files as images
 from tgslam.datasets.calibration import check_size
-from tgslam.datasets.resampling import DepthResampler, Resizer, same_view
+from tgslam.datasets.resampling import DepthResampler, Resizer, in_view
 from tgslam.datasets.stored import StoredFrames, StoredRecording
 from tgslam.datasets.truth import SceneTruth
 from tgslam.errors import DatasetError, FrameError
@@ -45,8 +45,8 @@ class FolderSource:
             else None
         )
         self._told_size = False  # that depth is of another one
-        self._resampler = _resampler(recording, self._stored)
         self._resizer = None if config.width in (0, width) else Resizer(self._stored, config.width, recording.name)
+        self._resampler = _resampler(recording, self.camera)
 
     @property
     def name(self) -> str:
@@ -71,11 +71,8 @@ class FolderSource:
             raise IndexError(f"frame {index} of {self.name}: it has frames 0 to {len(self) - 1}")
         frames = self._recording.frames
         rgb, raw = frames.colour(index), frames.depth(index)
-        rgb, raw = self._aligned(index, rgb, raw)
-        if self._flips_rows:
-            rgb, raw = rgb[::-1], raw[::-1]
-        if self._resizer is not None:
-            rgb, raw = self._resizer.colour(rgb), self._resizer.depth(raw)
+        self._check_sizes(index, rgb.shape[:2], raw.shape)
+        rgb, raw = self._colour(rgb), self._depth(raw)
         return Frame(index, self._times_s[index], colour_as_float(rgb), self._depth_m(index, raw))
 
     def groundtruth(self) -> Trajectory | None:
@@ -86,18 +83,24 @@ class FolderSource:
         """None: nobody has labelled the surfaces of a recording."""
         return None
 
-    def _aligned(self, index: int, rgb: NDArray[np.uint8], raw: NDArray[Any]) -> tuple[NDArray[np.uint8], NDArray[Any]]:
-        """Colour and depth, pixel for pixel, without distortion, as the stored images have their rows."""
-        self._check_sizes(index, rgb.shape[:2], raw.shape)
-        if self._resampler is None and raw.shape != rgb.shape[:2]:
-            if not self._told_size:
-                self._told_size = True
-                _log.info("%s: depth is %dx%d, and is brought to colour's size", self.name, raw.shape[1], raw.shape[0])
-            raw = same_view(raw.shape, rgb.shape[:2])(raw)
+    def _colour(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """As the source's camera sees it."""
         if self._undistorter is not None:
             rgb = self._undistorter.colour(rgb)
-            raw = raw if self._resampler is not None else self._undistorter.depth(raw)
-        return rgb, raw if self._resampler is None else self._resampler(raw)
+        if self._flips_rows:
+            rgb = rgb[::-1]
+        return rgb if self._resizer is None else self._resizer.colour(rgb)
+
+    def _depth(self, raw: NDArray[Any]) -> NDArray[Any]:
+        """As the source's camera sees it."""
+        if self._resampler is not None:
+            return self._resampler(raw)
+        if raw.shape != self._stored.shape and not self._told_size:
+            self._told_size = True
+            _log.info("%s: depth is %dx%d, and is brought to colour's size", self.name, raw.shape[1], raw.shape[0])
+        if self._undistorter is not None:
+            raw = self._undistorter.depth(in_view(raw, self._stored.shape))
+        return in_view(raw[::-1] if self._flips_rows else raw, self.camera.shape)
 
     def _depth_m(self, index: int, raw: NDArray[Any]) -> NDArray[np.float32]:
         config = self._config

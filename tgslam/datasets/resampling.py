@@ -53,10 +53,12 @@ class Resampling:
             return upper + (lower - upper) * down, (least > 0) & (most - least <= _EDGE * least)
 
 
-def same_view(stored: tuple[int, ...], shape: tuple[int, ...]) -> Resampling:
-    """From images of `stored` (height, width) to ones of `shape` that show the same in pixels of another size."""
-    rows, columns = ((np.arange(new) + 0.5) * (old / new) - 0.5 for new, old in zip(shape, stored, strict=True))
-    return Resampling(columns, rows)
+def in_view(depth: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:
+    """Depth [h, w] on a grid of `shape` (height, width) that shows the same in pixels of another size."""
+    if depth.shape == shape:
+        return depth
+    rows, columns = ((np.arange(new) + 0.5) * (old / new) - 0.5 for new, old in zip(shape, depth.shape, strict=True))
+    return Resampling(columns, rows)(depth)
 
 
 class DepthResampler:
@@ -76,7 +78,7 @@ class DepthResampler:
 
 
 class Resizer:
-    """Makes images smaller: colour is averaged over the pixels that fall together, depth is looked up in between."""
+    """Makes colour smaller: the mean of the pixels that fall together."""
 
     def __init__(self, stored: Camera, width: int, name: str) -> None:
         """Raises ConfigError for a width beyond that of the stored images."""
@@ -95,12 +97,7 @@ class Resizer:
             cx=(stored.cx + 0.5) * across - 0.5,
             cy=(stored.cy + 0.5) * down - 0.5,
         )
-        self._resampling = same_view(stored.shape, self.camera.shape)
 
     def colour(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """[H, W, 3] -> of the camera's size."""
         return cv2.resize(rgb, (self.camera.width, self.camera.height), interpolation=cv2.INTER_AREA)
-
-    def depth(self, raw: NDArray[Any]) -> NDArray[Any]:
-        """[H, W] -> of the camera's size."""
-        return self._resampling(raw)
