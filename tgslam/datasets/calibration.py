@@ -67,7 +67,8 @@ def of_matrix(K: NDArray[np.float64], size: tuple[int, int] | None = None) -> Ca
 def typical(intrinsics: NDArray[np.float64], size: tuple[int, int], name: str) -> Calibration:
     """One camera for frames whose fx, fy, cx, cy [N, 4] px differ a little, as focus moves: the median."""
     median = np.median(intrinsics, axis=0)
-    spread = float(np.abs(intrinsics[:, :2] / median[:2] - 1.0).max())
+    with np.errstate(divide="ignore", invalid="ignore"):
+        spread = float(np.abs(intrinsics[:, :2] / median[:2] - 1.0).max())
     if spread > _MUCH_ZOOM:
         _log.warning("%s: focal lengths differ by %.1f%% between frames; one is used for all", name, 100 * spread)
     fx, fy, cx, cy = (float(value) for value in median)

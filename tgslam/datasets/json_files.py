@@ -19,8 +19,8 @@ _MOST_BYTES = 1 << 29
 def read_object(path: Path) -> dict[str, Any]:
     """The JSON object that a file holds. Raises DatasetError."""
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise DatasetError(f"{path}: over {_MOST_BYTES >> 20} MiB, which is no description of a recording")
+        if path.stat().st_size > _MOST_BYTES or not path.is_file():
+            raise DatasetError(f"{path}: no file, or over {_MOST_BYTES >> 20} MiB; it should describe the recording")
         data = path.read_bytes()
     except OSError as cause:
         raise DatasetError(f"{path}: cannot be read ({cause.strerror})") from cause
