@@ -23,6 +23,7 @@ from tgslam.datasets.groundtruth import read_groundtruth
 from tgslam.datasets.image_files import read_colour, read_raw_depth
 from tgslam.datasets.image_header import claimed_size
 from tgslam.datasets.layouts import record3d
+from tgslam.datasets.time_matching import seconds_in
 from tgslam.errors import ConfigError, DatasetError, FrameError
 from tgslam.geometry import quat_wxyz_from_matrix
 
@@ -312,6 +313,22 @@ def test_clocks_in_nanoseconds_are_read_in_seconds(folder: Path, caplog: pytest.
     truth = source.groundtruth()
     assert truth is not None and truth.timestamps_s.tolist() == [start_s + 5]
     assert "nanoseconds" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("times", "seconds"),
+    [
+        ([0, 33_333_333, 66_666_667], 1e-9),
+        ([1000, 34_333, 67_667], 1e-6),
+        ([1_700_000_000_000, 1_700_000_000_033], 1e-3),
+        ([1_700_000_000.0, 1_700_000_000.033], 1.0),
+        ([2, 3, 4, 7], 1.0),
+        ([0.0, 0.0, 400.0], 1.0),
+        ([7.0], 1.0),
+    ],
+)
+def test_the_unit_of_a_clock_is_told_from_its_times(times: list[float], seconds: float) -> None:
+    assert seconds_in(times, "rgb.txt") == seconds
 
 
 @pytest.mark.parametrize("name", ["frame {t:.2f}.png", "a,b {t:.2f}.png", "зимний-каток {t:.2f}.png", "#{t:.2f}.png"])
