@@ -15,7 +15,7 @@ from tgslam.datasets.calibration import check_size
 from tgslam.datasets.resampling import DepthResampler, Resizer, in_view
 from tgslam.datasets.stored import StoredFrames, StoredRecording
 from tgslam.datasets.truth import SceneTruth
-from tgslam.errors import DatasetError, FrameError
+from tgslam.errors import ConfigError, DatasetError, FrameError
 from tgslam.pixels import colour_as_float
 from tgslam.types import Frame, Trajectory
 
@@ -139,12 +139,17 @@ def _resampler(recording: StoredRecording, camera: Camera) -> DepthResampler | N
     depth_camera = recording.depth_camera
     if depth_camera is None:
         return None
+    own = depth_camera.calibration
+    if not (np.isfinite(own.matrix).all() and own.fx > 0 and own.fy > 0):
+        raise ConfigError(
+            f"{recording.name}: no depth camera has fx, fy, cx, cy of {own.fx:g}, {own.fy:g}, {own.cx:g}, {own.cy:g} px"
+        )
     if not depth_camera.is_concentric:
         _log.warning(
             "%s: its depth camera stands beside the colour camera, which is not made up for; set dataset.depth_camera",
             recording.name,
         )
-    return DepthResampler(depth_camera.calibration, camera)
+    return DepthResampler(own, camera)
 
 
 def _require_depth(name: str, frames: StoredFrames) -> None:
