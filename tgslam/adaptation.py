@@ -15,6 +15,7 @@ from tgslam.slam import Slam as RoomSlam
 from tgslam.types import Frame, FrameReport, Gaussians, Plane, Trajectory
 
 _log = logging.getLogger(__name__)
+_USUAL_SCALE = 5000.0  # units of depth in a metre where the settings leave them open: the TUM benchmark's
 
 
 class Slam:
@@ -79,7 +80,7 @@ class Slam:
             if per_unit <= UNUSUAL * USUAL_NOISE.per_m2:  # sensors are much alike, and less noise is no gain
                 per_unit = USUAL_NOISE.per_m2
         if config.unit_m is None:
-            _warn_of_scale(config.dataset.depth_scale, found, reach, self._unit_m)
+            _warn_of_scale(config.dataset.depth_scale or _USUAL_SCALE, found, reach, self._unit_m)
         loss = dataclasses.replace(config.loss, depth_sigma_per_m2=per_unit)
         if loss.noise != self._slam.config.loss.noise:
             self._slam = RoomSlam(self.camera, dataclasses.replace(config, loss=loss))

@@ -38,7 +38,8 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
         "Ctrl-C ends the run after the current frame and saves everything so far.",
     )
     parser.add_argument("config", nargs="?", type=Path, metavar="CONFIG", help="YAML file, or a packaged one by name")
-    parser.add_argument("--input", type=Path, metavar="DIR", help="folder of the sequence")
+    parser.add_argument("--input", type=Path, metavar="PATH", help="folder or file of the recording")
+    parser.add_argument("--format", metavar="NAME", help="its layout (default: told from its files)")
     parser.add_argument("--output", type=Path, metavar="DIR", help="run folder (default: a new one under runs/)")
     parser.add_argument("--frames", metavar="START:STOP:STEP", help="which frames, as a Python slice (100: or ::2)")
     parser.add_argument(
@@ -56,7 +57,8 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
 def execute(args: argparse.Namespace) -> int:
     """Do the run and evaluate it; 130 when it was stopped early."""
     started_s = time.perf_counter()
-    config = resolve_config(args.config, args.input, args.set)
+    named = [] if args.format is None else [f"dataset.format={args.format}"]
+    config = resolve_config(args.config, args.input, [*args.set, *named])
     frames = parse_frames(args.frames)
     device = engine.start_device(args.device, args.threads)
     source = open_frames(config, args.input, frames)
