@@ -13,6 +13,20 @@ settings.register_profile("tgslam", deadline=None, derandomize=True)
 settings.load_profile("tgslam")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """`--long`: tests that take minutes and tell what shorter ones mostly tell too."""
+    parser.addoption("--long", action="store_true", help="run the tests marked `long` as well")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out what is marked `long`, unless it is asked for."""
+    if config.getoption("--long"):
+        return
+    for item in items:
+        if item.get_closest_marker("long"):
+            item.add_marker(pytest.mark.skip(reason="long: run it with --long"))
+
+
 @pytest.fixture(scope="session")
 def clips_dir() -> Path:
     """Folder of the benchmark clips: TGSLAM_TEST_DATA, or shared/data beside the checkout. Skips without it."""

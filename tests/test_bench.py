@@ -291,6 +291,7 @@ def test_track_needs_frames_enough(capsys: pytest.CaptureFixture[str]) -> None:
     assert "3 are needed" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_run_compiles_once_and_leaves_nothing(tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(tmp_path)
     short = ["--set", "mapping.final_iterations=0", "--set", "planes.enabled=false"]  # fewer kernels to compile

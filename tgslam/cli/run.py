@@ -27,6 +27,7 @@ from tgslam.types import Trajectory
 
 _log = logging.getLogger(__name__)
 _EXIT_INTERRUPTED = 130
+_BUDGETS = {"fast": 0.5, "normal": 1.0, "high": 5.0}  # of refinement, by --quality
 
 
 def add_parser(commands: Any) -> argparse.ArgumentParser:
@@ -45,6 +46,12 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
     parser.add_argument(
         "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override a setting; repeatable"
     )
+    parser.add_argument(
+        "--quality",
+        choices=tuple(_BUDGETS),
+        help="how much time the map's sharpness is given: mapping.budget of "
+        + ", ".join(f"{budget:g}" for budget in _BUDGETS.values()),
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace the run that --output holds")
     parser.add_argument("--no-final", action="store_true", help="leave out the final refinement of the map")
     engine.add_device_option(parser)
@@ -58,7 +65,8 @@ def execute(args: argparse.Namespace) -> int:
     """Do the run and evaluate it; 130 when it was stopped early."""
     started_s = time.perf_counter()
     named = [] if args.format is None else [f"dataset.format={args.format}"]
-    config = resolve_config(args.config, args.input, [*args.set, *named])
+    budget = [] if args.quality is None else [f"mapping.budget={_BUDGETS[args.quality]:g}"]
+    config = resolve_config(args.config, args.input, [*args.set, *named, *budget])
     frames = parse_frames(args.frames)
     device = engine.start_device(args.device, args.threads)
     source = open_frames(config, args.input, frames)

@@ -97,9 +97,9 @@ class StepSizeSettings:
     """How far a step of refinement goes. All but colour_relaxation are rates of Adam: the size of a step."""
 
     rate_mean_px: float = setting(0.15, 0.0, 10.0, doc="Of means, px at a depth of 1 m.")
-    rate_scale: float = setting(0.005, 0.0, 1.0, doc="Of scales, in their logarithm.")
-    rate_rotation: float = setting(0.002, 0.0, 1.0, doc="Of rotations, in components of the unit quaternion.")
-    rate_opacity: float = setting(0.03, 0.0, 10.0, doc="Of opacities, in their logit.")
+    rate_scale: float = setting(0.06, 0.0, 1.0, doc="Of scales, in their logarithm.")
+    rate_rotation: float = setting(0.01, 0.0, 1.0, doc="Of rotations, in components of the unit quaternion.")
+    rate_opacity: float = setting(0.1, 0.0, 10.0, doc="Of opacities, in their logit.")
     rate_colour: float = setting(0.01, 0.0, 1.0, doc="Of colours, intensity in [0, 1]; only with optimizer: adam.")
     rate_pose: float = setting(0.0003, 0.0, 1.0, doc="Of keyframe poses, rad and m; only with refine_poses.")
     colour_relaxation: float = setting(
@@ -137,6 +137,12 @@ class MappingConfig:
     iterations: int = setting(12, 0, 10_000, doc="Steps of refinement at a keyframe, each on one view.")
     final_iterations: int = setting(
         120, 0, 1_000_000, doc="Steps of refinement after the last frame, over all keyframes; 0 = none."
+    )
+    final_rounds: int = setting(
+        4, 0, 100_000, doc="In the end every keyframe gets so many steps at least; with final_iterations: 0 none."
+    )
+    budget: float = setting(
+        1.0, 0.0, 1000.0, doc="What all these steps are multiplied by: time for sharpness, see docs/experiments.md."
     )
     refine_poses: bool = setting(
         False,

@@ -130,6 +130,9 @@ class TrackingConfig:
     exposure: str = setting(
         "gain", choices=("none", "gain", "gain_bias"), doc="What is fitted of a frame's brightness against the map."
     )
+    recognition: bool = setting(
+        True, doc="Frames whose alignment is in doubt, or that are lost, are also sought where they are recognised."
+    )
     expert: TrackingExpert = field(default_factory=TrackingExpert)
 
 

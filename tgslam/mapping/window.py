@@ -48,7 +48,7 @@ class WindowRefinement:
         self._know_planes()
         window = self._window()
         poses: dict[int, Matrix4] = {}
-        for view in _in_turn([*window, *self._anchors(window)], self._config.iterations):
+        for view in _in_turn([*window, *self._anchors(window)], self._steps(self._config.iterations)):
             self._step(view, poses)
         self._move(poses)
         prune(self._world.gaussians, self._config.expert.pruning)
@@ -70,7 +70,7 @@ class WindowRefinement:
             return
         window = self._window()
         poses: dict[int, Matrix4] = {}
-        views = _in_turn([*self._anchors(window), *window], self._config.iterations)
+        views = _in_turn([*self._anchors(window), *window], self._steps(self._config.iterations))
         for view, pace in zip(views, np.linspace(1.0, _LAST_PACE, len(views)), strict=True):
             self._step(view, poses, float(pace))
         self._move(poses)
@@ -78,12 +78,17 @@ class WindowRefinement:
 
     def finish(self) -> None:
         """The final pass: every keyframe in turn, in random order, poses fixed, until colours are the mean of views."""
-        keyframes = self._world.keyframes
-        rounds = range(0, self._config.final_iterations, max(len(keyframes), 1))
+        keyframes, config = self._world.keyframes, self._config
+        least = config.final_rounds * len(keyframes) if config.final_iterations else 0
+        rounds = range(0, self._steps(max(config.final_iterations, least)), max(len(keyframes), 1))
         views = [k for _ in rounds for k in self._rng.permutation(len(keyframes))]
         for view, pace in zip(views, np.linspace(1.0, _FINAL_PACE, len(views)), strict=True):
             self.refiner.step(keyframes[view], colour_pace=float(pace))
         prune(self._world.gaussians, self._config.expert.pruning)
+
+    def _steps(self, count: int) -> int:
+        """Of these steps, so many as there is time for."""
+        return round(self._config.budget * count)
 
     def _know_planes(self) -> None:
         if self.refiner.structure and self._world.planes:

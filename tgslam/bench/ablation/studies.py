@@ -50,6 +50,7 @@ def keys_of(overrides: tuple[str, ...]) -> frozenset[str]:
 _TRAJECTORY = (Column("ate_rmse_cm", "ATE, cm", 2), Column("ate_rmse_all_cm", "ATE, all frames, cm", 2))
 _IMAGES = (
     Column("psnr_db", "PSNR, dB", 2),
+    Column("psnr_affine_db", "PSNR, colours fitted, dB", 2),
     Column("ssim", "SSIM", 4),
     Column("lpips", "LPIPS", 3),
     Column("depth_l1_cm", "depth L1, cm", 2),
@@ -114,4 +115,31 @@ VIEWPOINTS = Study(
     columns=(*_TRAJECTORY, *_IMAGES, _CLOSURES, _PLANES, _FPS),
     scenes=("corridor", "room"),
 )
-STUDIES = {study.name: study for study in (INTERVAL, STRUCTURE, GATE, TERMS, VIEWPOINTS)}
+RECORDINGS = Study(
+    name="recordings",
+    title="what recordings that nobody tuned to ask for",
+    common=(),
+    variants=(
+        Variant("all", ()),
+        Variant("exposure constant", ("tracking.exposure=none",)),
+        Variant("no recognition", ("tracking.recognition=false",)),
+        Variant("no closures, no loops", ("closures.enabled=false", "loops.enabled=false")),
+        Variant("a Kinect in a room", ("loss.depth_sigma_per_m2=0.0015", "unit_m=1")),
+    ),
+    columns=(*_TRAJECTORY, _TRACKED, *_IMAGES, _CLOSURES, _FPS),
+    scenes=("room", "corridor"),
+)
+QUALITY = Study(
+    name="quality",
+    title="time for refinement of the map",
+    common=(),
+    variants=(
+        Variant("1", ("mapping.budget=1",)),
+        *(Variant(f"{budget:g}", (f"mapping.budget={budget:g}",)) for budget in (0.5, 2.0, 5.0)),
+    ),
+    columns=(*_TRAJECTORY, *_IMAGES, _FPS),
+    scenes=("room", "corridor"),
+)
+STUDIES = {
+    study.name: study for study in (INTERVAL, STRUCTURE, GATE, TERMS, VIEWPOINTS, RECORDINGS, QUALITY)
+}
