@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +14,16 @@ from tgslam.datasets.detection import told_format
 from tgslam.datasets.source import RgbdSource, parse_frame_slice
 
 Frames = tuple[int | None, int | None, int | None]
+
+
+def add_input_options(parser: argparse.ArgumentParser) -> None:
+    """What names a recording and its settings: CONFIG, `--input`, `--frames` and `--set`."""
+    parser.add_argument("config", nargs="?", type=Path, metavar="CONFIG", help="YAML file, or a packaged one by name")
+    parser.add_argument("--input", type=Path, metavar="DIR", help="folder of the sequence")
+    parser.add_argument("--frames", metavar="START:STOP:STEP", help="which frames, as a Python slice (100: or ::2)")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override a setting; repeatable"
+    )
 
 
 def resolve_config(config: Path | None, input_dir: Path | None, overrides: Sequence[str]) -> Config:

@@ -12,7 +12,7 @@ from typing import Any
 
 from tgslam import __version__, pipeline
 from tgslam.cli import engine
-from tgslam.cli.inputs import can_read_ahead, open_frames, parse_frames, resolve_config
+from tgslam.cli.inputs import add_input_options, can_read_ahead, open_frames, parse_frames, resolve_config
 from tgslam.cli.interrupt import StopRequest
 from tgslam.cli.options import natural
 from tgslam.cli.summary import print_metrics
@@ -37,13 +37,8 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
         description="Track the camera through an RGB-D sequence and build its Gaussian map. "
         "Ctrl-C ends the run after the current frame and saves everything so far.",
     )
-    parser.add_argument("config", nargs="?", type=Path, metavar="CONFIG", help="YAML file, or a packaged one by name")
-    parser.add_argument("--input", type=Path, metavar="DIR", help="folder of the sequence")
+    add_input_options(parser)
     parser.add_argument("--output", type=Path, metavar="DIR", help="run folder (default: a new one under runs/)")
-    parser.add_argument("--frames", metavar="START:STOP:STEP", help="which frames, as a Python slice (100: or ::2)")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override a setting; repeatable"
-    )
     parser.add_argument("--overwrite", action="store_true", help="replace the run that --output holds")
     parser.add_argument("--no-final", action="store_true", help="leave out the final refinement of the map")
     engine.add_device_option(parser)

@@ -89,7 +89,9 @@ class FolderSource:
 
     def groundtruth(self) -> Trajectory | None:
         """Camera-to-world poses from the ground truth file, or None without one. Raises DatasetError."""
-        return None if self._groundtruth is None else read_groundtruth(self._groundtruth)
+        if self._groundtruth is None:
+            return None
+        return read_groundtruth(self._groundtruth, [pair.timestamp_s for pair in self._pairs])
 
     def truth(self) -> SceneTruth | None:
         """None: nobody has labelled the surfaces of a recording."""

@@ -10,6 +10,7 @@ from typing import NamedTuple, TypeVar
 
 from tgslam.datasets.time_matching import associate_times
 from tgslam.errors import DatasetError
+from tgslam.files.clock import ticks_per_second, unit_name
 from tgslam.files.tum_text import read_rows
 
 _log = logging.getLogger(__name__)
@@ -84,7 +85,7 @@ def pairs_from_associations(path: Path) -> list[ImagePair]:
                 path.parent / fields[depth_at + 1],
             )
         )
-    return _by_time(pairs, path)
+    return in_seconds(_by_time(pairs, path), path)
 
 
 def _is_depth(name: str) -> bool:
@@ -97,7 +98,16 @@ def _read_list(path: Path) -> list[_Image]:
         if len(fields) != 2:
             raise DatasetError(f"{path}:{line}: expected 'timestamp file', found {' '.join(fields)[:60]!r}")
         images.append(_Image(_timestamp(fields[0], f"{path}:{line}"), path.parent / fields[1]))
-    return _by_time(images, path)
+    return in_seconds(_by_time(images, path), path)
+
+
+def in_seconds(rows: list[_Stamped], path: Path) -> list[_Stamped]:
+    """Rows at increasing times of a clock that may count in nanoseconds or such; it is then said."""
+    ticks = ticks_per_second([row.timestamp_s for row in rows])
+    if ticks == 1.0:
+        return rows
+    _log.warning("%s: its clock counts in %s; times are divided by %g", path, unit_name(ticks), ticks)
+    return [row._replace(timestamp_s=row.timestamp_s / ticks) for row in rows]
 
 
 def _timestamp(text: str, where: str) -> float:

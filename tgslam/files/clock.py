@@ -1,0 +1,34 @@
+"""What a recording's clock counts in: seconds, or the nanoseconds, microseconds or milliseconds of other programs."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+_UNITS = {1e9: "nanoseconds", 1e6: "microseconds", 1e3: "milliseconds"}
+_LEAST_SPACING = 200.0  # between frames, in what the clock counts: nobody films a frame every three minutes
+_SLOWEST_S = 2.0  # between frames of what is filmed
+_EPOCHS = ((3e16, 1e9), (3e13, 1e6), (3e10, 1e3))  # times since 1970: of this century in seconds, these are far ahead
+
+
+def ticks_per_second(times: ArrayLike) -> float:
+    """By how much to divide times [N], increasing, for seconds: 1.0 where they are, or where nothing says they aren't.
+
+    Image numbers, one apart, stay as they are.
+    """
+    values = np.asarray(times, np.float64)
+    values = values[np.isfinite(values)]
+    latest = float(values.max(initial=0.0))
+    since_1970 = next((unit for least, unit in _EPOCHS if latest > least), None)
+    if since_1970 is not None:
+        return since_1970
+    gaps = np.diff(np.unique(values))
+    spacing = float(np.median(gaps)) if len(gaps) else 0.0
+    if spacing < _LEAST_SPACING:
+        return 1.0
+    return next((unit for unit in sorted(_UNITS) if spacing / unit <= _SLOWEST_S), 1.0)
+
+
+def unit_name(ticks: float) -> str:
+    """What a clock of so many ticks a second counts in."""
+    return _UNITS.get(ticks, "seconds")
