@@ -20,7 +20,7 @@ _JUMP = 0.06  # of the depth, between neighbours: an edge
 _REACH = 0.15  # of the width: a larger shift is not looked for
 _SCALES = np.arange(0.85, 1.16, 0.025)
 _SMALLEST = 0.012  # of the width: less is an edge's own width
-_LEAST_EDGES = 600  # pixels of jumps, in all frames together
+_LEAST_EDGES = 1200  # pixels of jumps, in all frames together
 _CLEAR = 6.0  # standard deviations by which the best place stands out
 _BETTER = 1.7  # times as high above chance as the place where depth is now
 
@@ -81,14 +81,14 @@ def _agreement(
 
 
 def _jumps(depth_m: NDArray[np.float32], step: int) -> NDArray[np.float32]:
-    """[H, W] 1 where depth jumps to a neighbour, 0 elsewhere; every step-th pixel and row."""
+    """[H, W] 1 on both sides of where depth jumps to a neighbour, 0 elsewhere; every step-th pixel and row."""
     depth = depth_m[step // 2 :: step, step // 2 :: step]
     found = np.zeros(depth.shape, np.float32)
     for axis in (0, 1):
         first, second = (depth[:-1], depth[1:]) if axis == 0 else (depth[:, :-1], depth[:, 1:])
         jump = (np.minimum(first, second) > 0) & (np.abs(first - second) > _JUMP * np.minimum(first, second))
-        target = found[:-1] if axis == 0 else found[:, :-1]
-        target[jump] = 1.0
+        for side in (found[:-1], found[1:]) if axis == 0 else (found[:, :-1], found[:, 1:]):
+            side[jump] = 1.0
     return found
 
 
