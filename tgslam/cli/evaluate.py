@@ -49,7 +49,7 @@ def execute(args: argparse.Namespace) -> int:
         source,
         groundtruth,
         lambda gaussians, planes: engine.make_show(record.camera, gaussians, planes, config),
-        read_ahead=can_read_ahead(config),
+        read_ahead=can_read_ahead(source),
     )
     if args.groundtruth is not None and found["ate_rmse_all_cm"] is None:
         raise EvaluationError(f"{args.groundtruth}: cannot be compared with {folder.trajectory}; see the warning above")

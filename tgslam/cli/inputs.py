@@ -11,7 +11,7 @@ from tgslam.config.loader import load
 from tgslam.config.schema import Config
 from tgslam.datasets import FrameRange, open_source
 from tgslam.datasets.detection import told_format
-from tgslam.datasets.source import RgbdSource, parse_frame_slice
+from tgslam.datasets.source import RgbdSource, parse_frame_slice, uses_kernels
 
 Frames = tuple[int | None, int | None, int | None]
 
@@ -49,6 +49,6 @@ def open_frames(config: Config, input_dir: Path | None, frames: Frames) -> RgbdS
     return source if frames == (None, None, None) else FrameRange(source, *frames)
 
 
-def can_read_ahead(config: Config) -> bool:
-    """Whether another thread may read the frames: not those of built-in scenes, which kernels of this thread draw."""
-    return config.dataset.format != "synthetic"
+def can_read_ahead(source: RgbdSource | None) -> bool:
+    """Whether another thread may read the frames: not those that kernels draw or register, as they run in this one."""
+    return source is not None and not uses_kernels(source)

@@ -94,7 +94,7 @@ def _run_and_evaluate(
             source,
             system,
             folder,
-            read_ahead=can_read_ahead(config),
+            read_ahead=can_read_ahead(source),
             refine=not args.no_final,
             observer=observer,
             stop_requested=stop,
@@ -106,7 +106,7 @@ def _run_and_evaluate(
         source,
         _groundtruth(source),
         None if stop() else lambda gaussians, planes: engine.make_show(source.camera, gaussians, planes, config),
-        read_ahead=can_read_ahead(config),
+        read_ahead=can_read_ahead(source),
         stop_requested=stop,
     )
     metrics["stage_s"] |= {

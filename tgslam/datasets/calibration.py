@@ -13,7 +13,7 @@ from tgslam.config.input_settings import DatasetConfig
 from tgslam.errors import ConfigError
 
 _log = logging.getLogger(__name__)
-_DISTORTION_LENGTHS = (4, 5, 8, 12, 14)  # OpenCV's models
+DISTORTION_LENGTHS = (4, 5, 8, 12, 14)  # OpenCV's models
 
 
 @dataclass(frozen=True)
@@ -95,8 +95,8 @@ def _check(calibration: Calibration) -> None:
         raise ConfigError("dataset.fx, fy, cx, cy and distortion must be finite numbers")
     if calibration.fx <= 0:
         raise ConfigError(f"dataset.fx is {calibration.fx:g}, but it must be positive (px)")
-    if calibration.distortion and len(calibration.distortion) not in _DISTORTION_LENGTHS:
+    if calibration.distortion and len(calibration.distortion) not in DISTORTION_LENGTHS:
         raise ConfigError(
             f"dataset.distortion has {len(calibration.distortion)} values; OpenCV's models have "
-            f"{', '.join(map(str, _DISTORTION_LENGTHS))} (k1, k2, p1, p2, k3, ...)"
+            f"{', '.join(map(str, DISTORTION_LENGTHS))} (k1, k2, p1, p2, k3, ...)"
         )

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+from collections import Counter
 from pathlib import Path
 
 from tgslam.camera import Camera
 from tgslam.config.input_settings import DatasetConfig
 from tgslam.datasets import image_files as images
 from tgslam.datasets.calibration import Calibration, check_size
+from tgslam.datasets.depth_camera import registration_of
 from tgslam.datasets.groundtruth import read_groundtruth
 from tgslam.datasets.lists import ImagePair
 from tgslam.datasets.truth import SceneTruth
@@ -17,7 +20,7 @@ from tgslam.pixels import colour_as_float
 from tgslam.types import Frame, Trajectory
 
 _log = logging.getLogger(__name__)
-_SAMPLE_IMAGES = 4  # of a recording, that tell its colours' range
+_SAMPLE_IMAGES = 4  # of a recording, that tell its colours' range and the size of its depth
 
 
 class FolderSource:
@@ -33,13 +36,16 @@ class FolderSource:
     ) -> None:
         """Reads colour images until one tells the image size.
 
-        Raises DatasetError if there is none, and ConfigError if the calibration is for images of another size.
+        Raises DatasetError if there is none, or if depth has another shape than colour and nothing says where its
+        camera is; and ConfigError if a calibration is for images of another size.
         """
         width, height = _image_size(name, pairs)
         self._unused_bits = _unused_bits(name, pairs)
         check_size(calibration, width, height, name)
         self._name = name
         self._camera = calibration.camera(width, height)
+        self._depth_size = _depth_size(pairs, (width, height))
+        self._registration = registration_of(config, calibration, self._camera, self._depth_size)
         self._pairs = pairs
         self._config = config
         self._groundtruth = groundtruth
@@ -60,11 +66,16 @@ class FolderSource:
         """The camera after undistortion and flip."""
         return self._camera
 
+    @property
+    def uses_kernels(self) -> bool:
+        """Whether depth is registered to colour as frames are read."""
+        return self._registration is not None
+
     def __len__(self) -> int:
         return len(self._pairs)
 
     def read(self, index: int) -> Frame:
-        """Decode frame `index`, undistort it and flip its rows where the format asks for it.
+        """Decode frame `index`, undistort it, flip its rows where the format asks for it, and bring depth to colour.
 
         Raises FrameError for images that are missing, damaged, of the wrong kind or size, or without any depth in
         the configured range, and IndexError outside 0 <= index < len(self).
@@ -75,7 +86,8 @@ class FolderSource:
         rgb, raw = images.read_colour(pair.colour, self._unused_bits), images.read_raw_depth(pair.depth)
         self._check_sizes(pair, rgb.shape[:2], raw.shape)
         if self._undistorter is not None:
-            rgb, raw = self._undistorter.colour(rgb), self._undistorter.depth(raw)
+            rgb = self._undistorter.colour(rgb)
+            raw = raw if self._registration is not None else self._undistorter.depth(raw)
         if self._flips_rows:
             rgb, raw = rgb[::-1], raw[::-1]
         config = self._config
@@ -85,6 +97,8 @@ class FolderSource:
                 f"{pair.depth}: no pixel has a depth from {config.min_depth_m:g} to {config.max_depth_m:g} m; "
                 "if all frames say so, check dataset.depth_scale"
             )
+        if self._registration is not None:
+            depth_m = self._registration(depth_m)
         return Frame(index, pair.timestamp_s, colour_as_float(rgb), depth_m)
 
     def groundtruth(self) -> Trajectory | None:
@@ -98,7 +112,7 @@ class FolderSource:
         return None
 
     def _check_sizes(self, pair: ImagePair, colour: tuple[int, ...], depth: tuple[int, ...]) -> None:
-        if colour != depth:
+        if self._registration is None and colour != depth:
             raise FrameError(
                 f"{pair.depth}: depth is {depth[1]}x{depth[0]}, but its colour image is {colour[1]}x{colour[0]}; "
                 "register depth to colour first"
@@ -106,6 +120,9 @@ class FolderSource:
         expected = (self._camera.height, self._camera.width)
         if colour != expected:
             raise FrameError(f"{pair.colour}: {colour[1]}x{colour[0]}, but the sequence is {expected[1]}x{expected[0]}")
+        width, height = self._depth_size
+        if depth != (height, width):
+            raise FrameError(f"{pair.depth}: {depth[1]}x{depth[0]}, but the sequence's depth is {width}x{height}")
 
 
 def _image_size(name: str, pairs: list[ImagePair]) -> tuple[int, int]:
@@ -121,10 +138,24 @@ def _image_size(name: str, pairs: list[ImagePair]) -> tuple[int, int]:
     raise DatasetError(f"{name}: none of its {len(pairs)} colour images can be read; the first: {first_error}")
 
 
+def _depth_size(pairs: list[ImagePair], colour: tuple[int, int]) -> tuple[int, int]:
+    """Width and height of most depth images, by a few of them; those of colour where there is no other."""
+    sizes: Counter[tuple[int, int]] = Counter()
+    for index in _some(pairs):
+        with contextlib.suppress(FrameError):
+            height, width = images.read_raw_depth(pairs[index].depth).shape
+            sizes[width, height] += 1
+    return colour if colour in sizes or not sizes else sizes.most_common(1)[0][0]
+
+
 def _unused_bits(name: str, pairs: list[ImagePair]) -> int:
     """See `images.unused_bits`; told by a few images of the recording."""
-    some = range(0, len(pairs), max(1, len(pairs) // _SAMPLE_IMAGES))
-    bits = images.unused_bits([pairs[index].colour for index in some])
+    bits = images.unused_bits([pairs[index].colour for index in _some(pairs)])
     if bits:
         _log.warning("%s: colour uses %d of its 16 bits; it is read as if white were 2^%d", name, 16 - bits, 16 - bits)
     return bits
+
+
+def _some(pairs: list[ImagePair]) -> range:
+    """The numbers of a few, spread evenly."""
+    return range(0, len(pairs), max(1, len(pairs) // _SAMPLE_IMAGES))
