@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,7 +12,12 @@ from tgslam.config.loader import load
 from tgslam.config.schema import Config
 from tgslam.datasets import FrameRange, open_source
 from tgslam.datasets.detection import told_format
+from tgslam.datasets.known_poses import OF_THE_RECORDING, KnownPoses, PosesByFrame, open_poses
 from tgslam.datasets.source import RgbdSource, parse_frame_slice, uses_kernels
+from tgslam.errors import ConfigError
+from tgslam.types import Trajectory
+
+_log = logging.getLogger(__name__)
 
 Frames = tuple[int | None, int | None, int | None]
 
@@ -47,6 +53,23 @@ def open_frames(config: Config, input_dir: Path | None, frames: Frames) -> RgbdS
     """The source of a run, narrowed to --frames. Raises DatasetError and ConfigError."""
     source = open_source(config.dataset, config.synthetic, config.seed, input_dir)
     return source if frames == (None, None, None) else FrameRange(source, *frames)
+
+
+def known_poses(config: Config, source: RgbdSource) -> KnownPoses | PosesByFrame | None:
+    """The poses that the settings name, None where they name none. Raises DatasetError and ConfigError."""
+    if config.poses.use == "none":
+        return None
+    if not config.poses.file:
+        raise ConfigError(f"poses.use is {config.poses.use}, but poses.file names none; give --poses FILE")
+    return open_poses(config.poses.file, source)
+
+
+def groundtruth_to_compare(config: Config, source: RgbdSource) -> Trajectory | None:
+    """The source's ground truth, unless the run was given just that. Raises DatasetError."""
+    if config.poses.use != "none" and config.poses.file == OF_THE_RECORDING:
+        _log.warning("the trajectory metrics are null: the run was given the poses that they would compare it with")
+        return None
+    return source.groundtruth()
 
 
 def can_read_ahead(source: RgbdSource | None) -> bool:

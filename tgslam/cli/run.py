@@ -12,7 +12,15 @@ from typing import Any
 
 from tgslam import __version__, pipeline
 from tgslam.cli import engine
-from tgslam.cli.inputs import add_input_options, can_read_ahead, open_frames, parse_frames, resolve_config
+from tgslam.cli.inputs import (
+    add_input_options,
+    can_read_ahead,
+    groundtruth_to_compare,
+    known_poses,
+    open_frames,
+    parse_frames,
+    resolve_config,
+)
 from tgslam.cli.interrupt import StopRequest
 from tgslam.cli.options import natural
 from tgslam.cli.summary import print_metrics
@@ -39,6 +47,16 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
     )
     add_input_options(parser)
     parser.add_argument("--output", type=Path, metavar="DIR", help="run folder (default: a new one under runs/)")
+    parser.add_argument(
+        "--poses",
+        metavar="FILE",
+        help="camera-to-world poses that are known, as text or NumPy array; `recording`: those that came with it",
+    )
+    parser.add_argument(
+        "--poses-use",
+        choices=("fixed", "prior"),
+        help="fixed: build the map only; prior: tracking starts there (default: fixed, or as poses.use says)",
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace the run that --output holds")
     parser.add_argument("--no-final", action="store_true", help="leave out the final refinement of the map")
     engine.add_device_option(parser)
@@ -51,10 +69,11 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
 def execute(args: argparse.Namespace) -> int:
     """Do the run and evaluate it; 130 when it was stopped early."""
     started_s = time.perf_counter()
-    config = resolve_config(args.config, args.input, args.set)
+    config = _with_poses(resolve_config(args.config, args.input, args.set), args.poses, args.poses_use)
     frames = parse_frames(args.frames)
     device = engine.start_device(args.device, args.threads)
     source = open_frames(config, args.input, frames)
+    poses = known_poses(config, source)
     path = args.output or fresh_folder(Path("runs"), source.name, datetime.now())
     folder = RunFolder.create(path, args.overwrite)
     record = RunRecord(
@@ -69,7 +88,7 @@ def execute(args: argparse.Namespace) -> int:
     folder.write_config(config)
     try:
         with StopRequest() as stop:
-            metrics = _run_and_evaluate(args, config, source, folder, stop)
+            metrics = _run_and_evaluate(args, config, source, poses, folder, stop)
     except BaseException as error:
         _mark_failed(folder, record, error)
         raise
@@ -85,7 +104,12 @@ def execute(args: argparse.Namespace) -> int:
 
 
 def _run_and_evaluate(
-    args: argparse.Namespace, config: Config, source: RgbdSource, folder: RunFolder, stop: StopRequest
+    args: argparse.Namespace,
+    config: Config,
+    source: RgbdSource,
+    poses: pipeline.Poses | None,
+    folder: RunFolder,
+    stop: StopRequest,
 ) -> dict[str, Any]:
     """The metrics of the run, from the files that it wrote; images are left out once the user asked to stop."""
     system = engine.make_system(source.camera, config)
@@ -94,6 +118,7 @@ def _run_and_evaluate(
             source,
             system,
             folder,
+            poses=poses,
             read_ahead=can_read_ahead(source),
             refine=not args.no_final,
             observer=observer,
@@ -104,7 +129,7 @@ def _run_and_evaluate(
         folder,
         config.evaluation,
         source,
-        _groundtruth(source),
+        _groundtruth(config, source),
         None if stop() else lambda gaussians, planes: engine.make_show(source.camera, gaussians, planes, config),
         read_ahead=can_read_ahead(source),
         stop_requested=stop,
@@ -119,10 +144,18 @@ def _run_and_evaluate(
     return metrics
 
 
-def _groundtruth(source: RgbdSource) -> Trajectory | None:
+def _with_poses(config: Config, file: str | None, use: str | None) -> Config:
+    """The settings with what `--poses` and `--poses-use` say."""
+    poses = config.poses if file is None else dataclasses.replace(config.poses, file=file)
+    if use is not None or (file is not None and poses.use == "none"):
+        poses = dataclasses.replace(poses, use=use or "fixed")
+    return dataclasses.replace(config, poses=poses)
+
+
+def _groundtruth(config: Config, source: RgbdSource) -> Trajectory | None:
     """The ground truth, opened only now that tracking is over; the run stands without it."""
     try:
-        return source.groundtruth()
+        return groundtruth_to_compare(config, source)
     except TgslamError as error:
         _log.warning("the trajectory metrics are null: %s", error)
         return None
