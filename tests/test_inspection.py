@@ -12,7 +12,7 @@ import pytest
 
 from tgslam.camera import Camera
 from tgslam.cli import main
-from tgslam.datasets.edge_alignment import misalignment
+from tgslam.datasets.edge_alignment import misalignment, warn_of_misalignment
 from tgslam.errors import FrameError
 from tgslam.inspection.survey import survey
 from tgslam.inspection.verdict import table, warnings
@@ -103,6 +103,16 @@ def test_depth_in_its_place_is_no_finding(frames: list[int]) -> None:
 def test_a_blank_wall_says_nothing_of_registration() -> None:
     blank = np.full((120, 160), 2.0, np.float32)
     assert misalignment(dataclasses.replace(scene(k), depth_m=blank) for k in range(6)) is None
+
+
+def test_a_run_warns_of_it_and_reads_few_frames(caplog: pytest.LogCaptureFixture) -> None:
+    warn_of_misalignment(Recorded(bad=(0,)))
+    assert not caplog.text
+    source = Recorded(lambda frame: moved(frame, 12, 0, 1.0))
+    read: list[int] = []
+    source.read = lambda index: read.append(index) or moved(scene(index), 12, 0, 1.0)  # type: ignore[method-assign]
+    warn_of_misalignment(source)
+    assert "recorded: depth does not lie on colour" in caplog.text and len(read) == 6
 
 
 def test_what_is_wrong_is_said_with_its_likely_cause() -> None:

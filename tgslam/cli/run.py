@@ -25,6 +25,7 @@ from tgslam.cli.interrupt import StopRequest
 from tgslam.cli.options import natural
 from tgslam.cli.summary import print_metrics
 from tgslam.config.schema import Config
+from tgslam.datasets.edge_alignment import warn_of_misalignment
 from tgslam.datasets.source import RgbdSource
 from tgslam.errors import TgslamError
 from tgslam.evaluation.run_metrics import complete, evaluate_run, peak_rss_mb
@@ -74,6 +75,8 @@ def execute(args: argparse.Namespace) -> int:
     device = engine.start_device(args.device, args.threads)
     source = open_frames(config, args.input, frames)
     poses = known_poses(config, source)
+    if config.dataset.format != "synthetic":  # whose depth lies where colour does
+        warn_of_misalignment(source)
     path = args.output or fresh_folder(Path("runs"), source.name, datetime.now())
     folder = RunFolder.create(path, args.overwrite)
     record = RunRecord(

@@ -6,6 +6,7 @@ has its jumps beside those changes, shifted and, as its camera sees wider or nar
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -13,8 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tgslam.datasets.read_ahead import read_frames
+from tgslam.datasets.source import RgbdSource
 from tgslam.types import Frame
 
+_log = logging.getLogger(__name__)
+_FRAMES = 6  # of a recording that are looked at
 _WIDTH_PX = 160  # images are halved until they are at most this wide
 _JUMP = 0.06  # of the depth, between neighbours: an edge
 _REACH = 0.15  # of the width: a larger shift is not looked for
@@ -32,6 +37,14 @@ class Misalignment:
     right_px: float
     down_px: float
     scale: float
+
+
+def warn_of_misalignment(source: RgbdSource) -> None:
+    """Say so where depth of a recording does not lie on colour, by a few of its frames."""
+    numbers = np.unique(np.linspace(0, len(source) - 1, _FRAMES).round().astype(int)).tolist()
+    off = misalignment(frame for frame in read_frames(source, False, numbers) if isinstance(frame, Frame))
+    if off is not None:
+        _log.warning("%s: %s", source.name, said_of(off))
 
 
 def misalignment(frames: Iterable[Frame]) -> Misalignment | None:

@@ -12,6 +12,7 @@ from tgslam.config.input_settings import DatasetConfig
 from tgslam.datasets import image_files as images
 from tgslam.datasets.calibration import Calibration, check_size
 from tgslam.datasets.depth_camera import registration_of
+from tgslam.datasets.depth_scale import other_scale
 from tgslam.datasets.groundtruth import read_groundtruth
 from tgslam.datasets.lists import ImagePair
 from tgslam.datasets.truth import SceneTruth
@@ -95,7 +96,7 @@ class FolderSource:
         if not depth_m.any():
             raise FrameError(
                 f"{pair.depth}: no pixel has a depth from {config.min_depth_m:g} to {config.max_depth_m:g} m; "
-                "if all frames say so, check dataset.depth_scale"
+                f"if all frames say so, check dataset.depth_scale{other_scale(raw, config.depth_scale)}"
             )
         if self._registration is not None:
             depth_m = self._registration(depth_m)
