@@ -83,7 +83,7 @@ def _corrections(E: Poses, G: Poses) -> Iterator[tuple[str, Poses]]:
         scaled[:, :3, 3] /= factor
         yield (
             (
-                f"its lengths are {float(f'{factor:.3g}'):g} times those of the estimate: it is in another unit than "
+                f"its lengths are {float(f'{factor:.2g}'):g} times those of the estimate: it is in another unit than "
                 "metres, or dataset.depth_scale is wrong"
             ),
             scaled,
