@@ -287,6 +287,7 @@ WRONG_ARGUMENTS = {
     "frames as a word": (["--frames", "all"], "--frames all"),
     "frames as a number": (["--frames", "3"], "--frames 3"),
     "backwards": (["--frames", "::-1"], "--frames"),
+    "no format": (["--format", "avi"], "`dataset.format` = avi must be one of auto, synthetic, tum"),
     "step of zero": (["--frames", "::0"], "--frames"),
 }
 

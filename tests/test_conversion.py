@@ -12,11 +12,12 @@ import pytest
 from tests.fakes import true_pose
 from tgslam.camera import Camera
 from tgslam.cli import main
-from tgslam.config.input_settings import SyntheticConfig
+from tgslam.config.input_settings import DatasetConfig, SyntheticConfig
 from tgslam.config.loader import load
 from tgslam.conversion.converter import convert
-from tgslam.conversion.layouts import LAYOUTS
+from tgslam.conversion.targets import LAYOUTS
 from tgslam.datasets import open_source
+from tgslam.datasets.detection import told_format
 from tgslam.datasets.known_poses import KnownPoses
 from tgslam.errors import DatasetError, FrameError, OutputError
 from tgslam.types import Frame, Trajectory
@@ -117,6 +118,20 @@ def test_nerfstudio_with_its_axes_and_its_pixel_centres(tmp_path: Path) -> None:
     np.testing.assert_allclose(depth * 0.001, TexturedSource().read(2).depth_m, atol=5.1e-4)
     colour = read_image(tmp_path / "out" / frame["file_path"])[..., ::-1]
     np.testing.assert_array_equal(colour, np.round(TexturedSource().read(2).colour * 255))
+
+
+@pytest.mark.parametrize(("to", "step_m"), [("replica", 1.0 / 6553.5), ("nerfstudio", 0.001)])
+def test_a_layout_that_others_read_is_read_here_too(tmp_path: Path, to: str, step_m: float) -> None:
+    write(tmp_path / "out", to)
+    config = told_format(DatasetConfig(), tmp_path / "out")
+    back, source = open_source(config, SyntheticConfig(), 0, tmp_path / "out"), TexturedSource()
+    assert config.format == to and len(back) == COUNT
+    np.testing.assert_allclose(back.camera.intrinsics, CAMERA.intrinsics)
+    for k in range(COUNT):
+        np.testing.assert_allclose(back.read(k).depth_m, source.read(k).depth_m, atol=0.51 * step_m)
+    truth = back.groundtruth()
+    assert truth is not None
+    np.testing.assert_allclose(truth.T_wc, source.groundtruth().T_wc, atol=1e-8)
 
 
 @pytest.mark.parametrize("cut", ["", '{"number": 2, "timest'])

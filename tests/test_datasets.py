@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tgslam.camera import Camera
-from tgslam.config.input_settings import DatasetConfig, SyntheticConfig
+from tgslam.config.input_settings import DatasetConfig, DatasetExpert, SyntheticConfig
 from tgslam.datasets import FrameRange, RgbdSource, open_source, parse_frame_slice
 from tgslam.datasets.calibration import Calibration, resolve
 from tgslam.datasets.image_files import Undistorter, read_colour, unused_bits
@@ -383,7 +383,7 @@ def test_list_that_is_no_text(folder: Path) -> None:
 
 def test_no_depth_in_time(folder: Path) -> None:
     with pytest.raises(DatasetError, match="depth_tolerance_s"):
-        opened(folder, replace(TUM, depth_tolerance_s=0.001))
+        opened(folder, replace(TUM, expert=DatasetExpert(depth_tolerance_s=0.001)))
 
 
 def test_colour_without_depth_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

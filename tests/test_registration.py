@@ -16,7 +16,7 @@ from tgslam.config.input_settings import DatasetConfig, DepthCameraConfig, Synth
 from tgslam.config.loader import load
 from tgslam.datasets import open_source
 from tgslam.datasets.calibration import Calibration
-from tgslam.datasets.depth_camera import DepthCamera, depth_camera, motion_of
+from tgslam.datasets.depth_camera import configured_depth_camera, motion_of, rays_of
 from tgslam.datasets.source import FrameRange, uses_kernels
 from tgslam.errors import ConfigError, DatasetError
 from tgslam.geometry import inverse, quat_wxyz_from_matrix, se3_exp
@@ -127,10 +127,10 @@ def test_a_surface_is_not_seen_from_behind() -> None:
 
 def test_rays_of_a_lens_are_where_opencv_projects_them() -> None:
     lens = (0.2, -0.3, 0.002, 0.003, 0.05)
-    camera = DepthCamera(Calibration(40.0, 41.0, 23.0, 18.0, lens), np.eye(4))
-    rays = camera.rays(48, 36)
+    calibration = Calibration(40.0, 41.0, 23.0, 18.0, lens)
+    rays = rays_of(calibration, 48, 36)
     points = np.concatenate([rays, np.ones((36, 48, 1))], -1).reshape(-1, 3)
-    seen = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.calibration.matrix, np.array(lens))[0]
+    seen = cv2.projectPoints(points, np.zeros(3), np.zeros(3), calibration.matrix, np.array(lens))[0]
     v, u = np.mgrid[:36, :48]
     np.testing.assert_allclose(seen.reshape(36, 48, 2), np.stack([u, v], -1), atol=0.02)
     assert np.abs(rays - DEPTH.rays()[..., :2]).max() > 0.01
@@ -158,7 +158,7 @@ def test_the_motion_is_given_as_numbers_or_as_a_matrix() -> None:
 def test_a_depth_camera_that_cannot_be(changes: dict, message: str) -> None:
     config = replace(DepthCameraConfig(intrinsics=(40.0, 41.0, 23.0, 18.0)), **changes)
     with pytest.raises(ConfigError, match=message):
-        depth_camera(config, (48, 36))
+        configured_depth_camera(config, (48, 36))
 
 
 def write(folder: Path, depth_m: np.ndarray, colour: Camera) -> Path:
@@ -197,8 +197,8 @@ def test_depth_of_another_resolution_shows_the_same_view(tmp_path: Path, caplog:
     caplog.set_level(logging.INFO)
     half = Camera(30, 20, 27.5, 27.0, 14.75, 9.25)  # what COLOUR is in blocks of 2x2
     source = opened(write(tmp_path, plane_depth(half), COLOUR))
-    assert "depth images are 30x20, colour images 60x40: taken as the same view" in caplog.text
     depth_m = source.read(0).depth_m
+    assert "depth is 30x20, and is brought to colour's size" in caplog.text
     assert (depth_m[1:-1, 1:-1] > 0).all()
     np.testing.assert_allclose(depth_m[1:-1, 1:-1], plane_depth(COLOUR)[1:-1, 1:-1], rtol=0.01)
     assert not uses_kernels(FrameRange(opened(write_registered(tmp_path / "registered")), 1))

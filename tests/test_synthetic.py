@@ -16,7 +16,6 @@ from tgslam.config.loader import load
 from tgslam.datasets import open_source
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.datasets.detection import told_format
-from tgslam.datasets.tum import open_tum
 from tgslam.errors import ConfigError
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, se3_log, transform_points
 from tgslam.kernels import procedural
@@ -281,7 +280,7 @@ def test_export_writes_a_tum_folder(tmp_path: Path, capsys):
     raw = cv2.imread(str(folder / "depth" / f"{frame.timestamp_s:.6f}.png"), cv2.IMREAD_UNCHANGED)
     assert raw.dtype == np.uint16
     np.testing.assert_allclose(raw / 5000.0, frame.depth_m, atol=1.01e-4)
-    read_back = open_tum(folder, load(folder / "camera.yaml").dataset)
+    read_back = open_source(load(folder / "camera.yaml").dataset, SyntheticConfig(), 0, folder)
     assert read_back.camera == one.camera and len(read_back) == 3
     np.testing.assert_allclose(read_back.read(1).colour, frame.colour, atol=1e-4)
     np.testing.assert_allclose(read_back.read(1).depth_m, frame.depth_m, atol=1.01e-4)

@@ -17,6 +17,7 @@ from tgslam.slam import Slam as RoomSlam
 from tgslam.types import Frame, FrameReport, Gaussians, Matrix4, Plane, Trajectory
 
 _log = logging.getLogger(__name__)
+_USUAL_SCALE = 5000.0  # units of depth in a metre where the settings leave them open: the TUM benchmark's
 
 
 class Slam:
@@ -85,7 +86,7 @@ class Slam:
             if per_unit <= UNUSUAL * USUAL_NOISE.per_m2:  # sensors are much alike, and less noise is no gain
                 per_unit = USUAL_NOISE.per_m2
         if config.unit_m is None:
-            _warn_of_scale(config.dataset.depth_scale, found, reach, self._unit_m)
+            _warn_of_scale(config.dataset.depth_scale or _USUAL_SCALE, found, reach, self._unit_m)
         loss = dataclasses.replace(config.loss, depth_sigma_per_m2=per_unit)
         poses = dataclasses.replace(config.poses, sigma_m=config.poses.sigma_m / self._unit_m)
         if loss.noise != self._slam.config.loss.noise or (poses.use == "prior" and self._unit_m != 1.0):

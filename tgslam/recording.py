@@ -62,7 +62,7 @@ def open_recording(
     format: str | None = None,
     frames: str | None = None,
 ) -> Recording:
-    """Open the folder of a recording; None = the built-in room, or the scene that the config names.
+    """Open a recording, a folder or a file; None = the built-in room, or the scene that the config names.
 
     config: whose sections `dataset` (format, camera, depth scale) and `synthetic` count here. format: as
     `dataset.format`, by default told from the folder's files. frames: "START:STOP:STEP", every part optional.

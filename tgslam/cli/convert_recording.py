@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from tgslam.cli import engine
-from tgslam.cli.inputs import add_input_options, open_frames, parse_frames, resolve_config
+from tgslam.cli.inputs import add_input_options, open_frames, parse_frames, resolve_config, settings_of
 from tgslam.config.loader import dump
 from tgslam.conversion.converter import convert
-from tgslam.conversion.layouts import LAYOUTS
+from tgslam.conversion.targets import LAYOUTS
 from tgslam.datasets.known_poses import OF_THE_RECORDING, open_poses
 from tgslam.output.console import error_console
 from tgslam.output.progress import count_progress
@@ -41,7 +41,7 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
 
 def execute(args: argparse.Namespace) -> int:
     """Write every frame."""
-    config = resolve_config(args.config, args.input, args.set)
+    config = resolve_config(args.config, args.input, settings_of(args))
     frames = parse_frames(args.frames)
     engine.start_device(args.device)
     source = open_frames(config, args.input, frames)

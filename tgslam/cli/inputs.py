@@ -25,11 +25,17 @@ Frames = tuple[int | None, int | None, int | None]
 def add_input_options(parser: argparse.ArgumentParser) -> None:
     """What names a recording and its settings: CONFIG, `--input`, `--frames` and `--set`."""
     parser.add_argument("config", nargs="?", type=Path, metavar="CONFIG", help="YAML file, or a packaged one by name")
-    parser.add_argument("--input", type=Path, metavar="DIR", help="folder of the sequence")
+    parser.add_argument("--input", type=Path, metavar="PATH", help="folder or file of the recording")
+    parser.add_argument("--format", metavar="NAME", help="its layout (default: told from its files)")
     parser.add_argument("--frames", metavar="START:STOP:STEP", help="which frames, as a Python slice (100: or ::2)")
     parser.add_argument(
         "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override a setting; repeatable"
     )
+
+
+def settings_of(args: argparse.Namespace) -> list[str]:
+    """What `--set` and `--format` say, as `resolve_config` takes it."""
+    return [*args.set, *([] if args.format is None else [f"dataset.format={args.format}"])]
 
 
 def resolve_config(config: Path | None, input_dir: Path | None, overrides: Sequence[str]) -> Config:
@@ -70,6 +76,12 @@ def groundtruth_to_compare(config: Config, source: RgbdSource) -> Trajectory | N
         _log.warning("the trajectory metrics are null: the run was given the poses that they would compare it with")
         return None
     return source.groundtruth()
+
+
+def depth_units(source: RgbdSource) -> float | None:
+    """By how many units in a metre a recording's depth is read; None where it is drawn, or came in metres."""
+    units: float | None = getattr(source, "depth_units", None)
+    return units
 
 
 def can_read_ahead(source: RgbdSource | None) -> bool:

@@ -7,7 +7,7 @@ import logging
 from typing import Any
 
 from tgslam.cli import engine
-from tgslam.cli.inputs import add_input_options, open_frames, parse_frames, resolve_config
+from tgslam.cli.inputs import add_input_options, depth_units, open_frames, parse_frames, resolve_config, settings_of
 from tgslam.inspection.survey import survey
 from tgslam.inspection.verdict import table, warnings
 from tgslam.output.console import error_console, print_table
@@ -31,13 +31,13 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
 
 def execute(args: argparse.Namespace) -> int:
     """Print the findings; 0 whatever they are, since the recording could be read."""
-    config = resolve_config(args.config, args.input, args.set)
+    config = resolve_config(args.config, args.input, settings_of(args))
     frames = parse_frames(args.frames)
     engine.start_device(args.device)
     source = open_frames(config, args.input, frames)
     with count_progress("frames", len(source), error_console(), args.quiet) as on_frame:
         found = survey(source, on_frame)
-    scale = None if config.dataset.format == "synthetic" else config.dataset.depth_scale
+    scale = None if config.dataset.format == "synthetic" else depth_units(source)
     print_table(f"{source.name}, format {config.dataset.format}", table(found, source.camera, scale))
     for line in warnings(found, source.camera, scale):
         _log.warning("%s: %s", source.name, line)

@@ -20,6 +20,7 @@ from tgslam.cli.inputs import (
     open_frames,
     parse_frames,
     resolve_config,
+    settings_of,
 )
 from tgslam.cli.interrupt import StopRequest
 from tgslam.cli.options import natural
@@ -70,7 +71,8 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
 def execute(args: argparse.Namespace) -> int:
     """Do the run and evaluate it; 130 when it was stopped early."""
     started_s = time.perf_counter()
-    config = _with_poses(resolve_config(args.config, args.input, args.set), args.poses, args.poses_use)
+    config = resolve_config(args.config, args.input, settings_of(args))
+    config = _with_poses(config, args.poses, args.poses_use)
     frames = parse_frames(args.frames)
     device = engine.start_device(args.device, args.threads)
     source = open_frames(config, args.input, frames)

@@ -6,6 +6,22 @@ from dataclasses import dataclass, field
 
 from tgslam.config.setting import setting
 
+FOLDER_FORMATS = (
+    "tum", "icl", "bonn", "replica", "7scenes", "tartanair", "scannet", "sens", "scannetpp", "open3d", "bundlefusion",
+    "nerfstudio", "record3d", "polycam", "ros", "folder",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class DatasetExpert:
+    """How images of recordings are found and paired."""
+
+    depth_tolerance_s: float = setting(
+        0.02, 0.0, 1.0, doc="Time between a colour image and the depth image that belongs to it, at most, s."
+    )
+    colour_topic: str = setting("", doc="Topic of the colour images of a ROS bag; empty: told from what they are.")
+    depth_topic: str = setting("", doc="Topic of the depth images of a ROS bag; empty: told from what they are.")
+
 
 @dataclass(frozen=True)
 class DepthCameraConfig:
@@ -29,8 +45,9 @@ class DatasetConfig:
 
     format: str = setting(
         "auto",
-        choices=("auto", "synthetic", "tum", "icl"),
-        doc="Built-in scene, TUM RGB-D or ICL-NUIM folder; auto: told from the folder's files, without one the scene.",
+        choices=("auto", "synthetic", *FOLDER_FORMATS),
+        doc="synthetic: a built-in scene. The others are layouts of recordings (docs/recordings.md). auto: told from "
+        "the files; without any, the built-in scene.",
     )
     fx: float = setting(0.0, doc="Focal length across, px.")
     fy: float = setting(
@@ -41,13 +58,18 @@ class DatasetConfig:
     distortion: tuple[float, ...] = setting(
         (), doc="Lens distortion in OpenCV's order k1, k2, p1, p2, k3; none if empty."
     )
-    depth_scale: float = setting(5000.0, 1e-3, 1e6, doc="Units of the depth images per metre.")
-    depth_tolerance_s: float = setting(
-        0.02, 0.0, 1.0, doc="Time between a colour image and the depth image that belongs to it, at most, s."
+    width: int = setting(0, 0, 8192, doc="Images are made so wide as they are read, px; 0 = they stay as they are.")
+    depth_scale: float | None = setting(
+        None,
+        1e-3,
+        1e6,
+        doc="Units of the depth images per metre, where they hold whole numbers; null: the format's own, or what the "
+        "recording says. Depth in floats is in metres.",
     )
     min_depth_m: float = setting(0.1, 0.0, 10.0, doc="Nearer measurements are dropped, m.")
     max_depth_m: float = setting(10.0, 0.1, 1000.0, doc="Farther measurements are dropped, m.")
     depth_camera: DepthCameraConfig = field(default_factory=DepthCameraConfig)
+    expert: DatasetExpert = field(default_factory=DatasetExpert)
 
 
 @dataclass(frozen=True)

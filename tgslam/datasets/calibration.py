@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from tgslam.camera import Camera
 from tgslam.config.input_settings import DatasetConfig
 from tgslam.errors import ConfigError
+from tgslam.types import Matrix4
 
 _log = logging.getLogger(__name__)
+_MUCH_ZOOM = 0.01  # relative change of focal lengths
 _MIDDLE = 0.1  # of an image: lenses are centred to within this, about
 _OFF_MIDDLE = 0.25
 DISTORTION_LENGTHS = (4, 5, 8, 12, 14)  # OpenCV's models
@@ -44,6 +46,43 @@ class Calibration:
         if self.flips_rows:
             return Camera(width, height, self.fx, -self.fy, self.cx, height - 1 - self.cy)
         return Camera(width, height, self.fx, self.fy, self.cx, self.cy)
+
+
+@dataclass(frozen=True)
+class DepthCamera:
+    """A depth camera of its own: its intrinsics, for images of `calibration.size`, and where it is."""
+
+    calibration: Calibration
+    T_colour_depth: Matrix4  # [4, 4] maps points of the depth camera's frame to the colour camera's, m
+
+    @property
+    def is_concentric(self) -> bool:
+        """Whether it stands where the colour camera does and looks the same way, to within 0.1 mm and 0.1 mrad."""
+        return bool(np.allclose(self.T_colour_depth, np.eye(4), atol=1e-4))
+
+
+def of_matrix(K: NDArray[np.float64], size: tuple[int, int] | None = None) -> Calibration:
+    """A camera matrix [3, 3], or larger, in px, without distortion."""
+    return Calibration(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), (), size)
+
+
+def typical(intrinsics: NDArray[np.float64], size: tuple[int, int], name: str) -> Calibration:
+    """One camera for frames whose fx, fy, cx, cy [N, 4] px differ a little, as focus moves: the median."""
+    median = np.median(intrinsics, axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        spread = float(np.abs(intrinsics[:, :2] / median[:2] - 1.0).max())
+    if spread > _MUCH_ZOOM:
+        _log.warning("%s: focal lengths differ by %.1f%% between frames; one is used for all", name, 100 * spread)
+    fx, fy, cx, cy = (float(value) for value in median)
+    return Calibration(fx, fy, cx, cy, (), size)
+
+
+def depth_camera(colour: Calibration, depth: Calibration, T_colour_depth: Matrix4 | None = None) -> DepthCamera | None:
+    """Of a recording that states both cameras; None where depth has the same camera as colour."""
+    T = np.eye(4) if T_colour_depth is None else T_colour_depth
+    found = DepthCamera(depth, T)
+    alike = np.allclose(colour.matrix, depth.matrix, atol=0.01) and colour.size == depth.size
+    return None if alike and found.is_concentric else found
 
 
 def resolve(config: DatasetConfig, default: Calibration | None, hint: str) -> Calibration:

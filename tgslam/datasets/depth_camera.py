@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -12,78 +10,56 @@ from numpy.typing import NDArray
 
 from tgslam.camera import Camera
 from tgslam.config.input_settings import DatasetConfig, DepthCameraConfig
-from tgslam.datasets.calibration import DISTORTION_LENGTHS, Calibration
-from tgslam.errors import ConfigError, DatasetError
+from tgslam.datasets.calibration import DISTORTION_LENGTHS, Calibration, DepthCamera
+from tgslam.errors import ConfigError
 from tgslam.geometry import matrix_from_quat_wxyz, orthonormalized
 from tgslam.types import FloatImage, Matrix4
 
-_log = logging.getLogger(__name__)
-_SAME_SHAPE = 0.01  # of the ratio of the sides
 _NOT_ORTHONORMAL = 0.01  # largest entry of R^T R - I
 _FARTHEST_M = 2.0  # between the cameras of one device: more are millimetres
 
-Register = Callable[[FloatImage], FloatImage]  # depth [H, W] m of the depth camera -> [h, w] of the colour camera
+
+class Register(Protocol):
+    """Brings depth [H, W] m of the depth camera into the pixels of the colour camera, [h, w]."""
+
+    stored_shape: tuple[int, int]  # (H, W)
+
+    def __call__(self, depth_m: FloatImage) -> FloatImage:
+        """A new array."""
 
 
-@dataclass(frozen=True)
-class DepthCamera:
-    """The camera of stored depth images, and where it is for the colour camera."""
-
-    calibration: Calibration
-    T_colour_depth: Matrix4  # [4, 4]
-
-    def rays(self, width: int, height: int) -> NDArray[np.float64]:
-        """[H, W, 2] x/z and y/z that each pixel of the stored images looks along."""
-        v, u = np.mgrid[:height, :width]
-        at = np.stack([u, v], -1).reshape(-1, 1, 2).astype(np.float64)
-        coefficients = np.asarray(self.calibration.distortion, np.float64)
-        return np.asarray(cv2.undistortPoints(at, self.calibration.matrix, coefficients).reshape(height, width, 2))
+def rays_of(calibration: Calibration, width: int, height: int) -> NDArray[np.float64]:
+    """[H, W, 2] x/z and y/z that each pixel of stored images looks along."""
+    v, u = np.mgrid[:height, :width]
+    at = np.stack([u, v], -1).reshape(-1, 1, 2).astype(np.float64)
+    coefficients = np.asarray(calibration.distortion, np.float64)
+    return np.asarray(cv2.undistortPoints(at, calibration.matrix, coefficients).reshape(height, width, 2))
 
 
 def register_to(colour: Camera, depth: DepthCamera, size: tuple[int, int]) -> Register:
     """What brings depth images of a size, (width, height) px, into the pixels of the colour camera, by a kernel."""
     from tgslam.ops.registration import Registration  # brings in the kernels, which other recordings do without
 
-    return Registration(depth.rays(*size), depth.T_colour_depth, colour)
+    return Registration(rays_of(depth.calibration, *size), depth.T_colour_depth, colour)
 
 
-def registration_of(
-    config: DatasetConfig, calibration: Calibration, colour: Camera, size: tuple[int, int]
-) -> Register | None:
-    """What the settings, or the size of depth images, (width, height) px, ask for; None: depth lies on colour.
+def own_depth_camera(
+    config: DatasetConfig, recorded: DepthCamera | None, colour: Calibration, size: tuple[int, int]
+) -> DepthCamera | None:
+    """The depth camera that the settings name, else that of the recording; None: depth shows what colour shows.
 
-    calibration: of the stored colour images. Depth of another resolution, but of the same shape, is taken to show what
-    colour does. Raises ConfigError for a depth camera that cannot be, and DatasetError for depth of another shape
-    without one.
+    colour: of its stored images. size: of the depth images, (width, height) px. Raises ConfigError for a depth camera
+    that cannot be.
     """
+    found = recorded
     if config.depth_camera != DepthCameraConfig():
-        if calibration.flips_rows:
-            raise ConfigError("dataset.depth_camera does not go with a negative dataset.fy, whose images are flipped")
-        return register_to(colour, depth_camera(config.depth_camera, size), size)
-    if size == (colour.width, colour.height):
-        return None
-    across, down = size[0] / colour.width, size[1] / colour.height
-    if abs(across / down - 1.0) > _SAME_SHAPE:
-        raise DatasetError(
-            f"depth images are {size[0]}x{size[1]}, colour images {colour.width}x{colour.height}: their shapes differ, "
-            "so depth has a camera of its own; set dataset.depth_camera, or register depth to colour first"
-        )
-    _log.info(
-        "depth images are %dx%d, colour images %dx%d: taken as the same view, and brought to the size of colour; "
-        "dataset.depth_camera overrules that", *size, colour.width, colour.height,
-    )  # fmt: skip
-    distortion = () if calibration.flips_rows else calibration.distortion
-    scaled = Calibration(
-        colour.fx * across,
-        colour.fy * down,
-        (colour.cx + 0.5) * across - 0.5,
-        (colour.cy + 0.5) * down - 0.5,
-        distortion,
-    )
-    return register_to(colour, DepthCamera(scaled, np.eye(4)), size)
+        found = configured_depth_camera(config.depth_camera, size)
+    if found is not None and colour.flips_rows:
+        raise ConfigError("a depth camera of its own does not go with a negative dataset.fy, whose images are flipped")
+    return found
 
 
-def depth_camera(config: DepthCameraConfig, size: tuple[int, int]) -> DepthCamera:
+def configured_depth_camera(config: DepthCameraConfig, size: tuple[int, int]) -> DepthCamera:
     """The camera that the settings describe, for images of a size, (width, height) px. Raises ConfigError."""
     key = "dataset.depth_camera"
     if len(config.intrinsics) != 4 or min(config.intrinsics[:2]) <= 0.0:

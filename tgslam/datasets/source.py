@@ -85,6 +85,12 @@ class FrameRange:
         """Whether the source that it was made from runs kernels as it reads."""
         return uses_kernels(self._source)
 
+    @property
+    def depth_units(self) -> float | None:
+        """See `FolderSource.depth_units`; None where there are none."""
+        units: float | None = getattr(self._source, "depth_units", None)
+        return units
+
     def __len__(self) -> int:
         return len(self._indices)
 

@@ -2,8 +2,22 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from tgslam.files.clock import ticks_per_second, unit_name
+
+_log = logging.getLogger(__name__)
+
+
+def seconds_in(times: ArrayLike, name: str) -> float:
+    """Seconds in the unit of the times [N] of frames. One that is no second is logged."""
+    ticks = ticks_per_second(times)
+    if ticks != 1.0:
+        _log.warning("%s: its times are in %s, and are read so", name, unit_name(ticks))
+    return 1.0 / ticks
 
 
 def associate_times(

@@ -7,16 +7,20 @@ from pathlib import Path
 
 from tgslam.config.input_settings import DatasetConfig
 from tgslam.datasets.calibration import Calibration, resolve
-from tgslam.datasets.folder import FolderSource
+from tgslam.datasets.groundtruth import groundtruth_file, poses_of_file
+from tgslam.datasets.layout import Layout
 from tgslam.datasets.lists import (
     ASSOCIATION_FILES,
     ImagePair,
     find_association_file,
+    has_image_numbers,
     pairs_from_associations,
     pairs_from_lists,
 )
+from tgslam.datasets.stored import ImageFrames, StoredRecording
 from tgslam.errors import DatasetError
 
+DEPTH_UNITS = 5000.0  # in a metre
 _SIZE = (640, 480)
 _FREIBURG = {  # the benchmark's published calibrations; freiburg3 is undistorted already
     "1": Calibration(517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633), _SIZE),
@@ -26,23 +30,22 @@ _FREIBURG = {  # the benchmark's published calibrations; freiburg3 is undistorte
 _FREIBURG_NAME = re.compile(r"(?:freiburg|(?<![a-z])fr)([123])(?!\d)")
 
 
-def open_tum(folder: Path, config: DatasetConfig) -> FolderSource:
-    """Open a sequence folder. The camera is the config's, or the benchmark's own one named by the folder.
+def open_tum(folder: Path, config: DatasetConfig) -> StoredRecording:
+    """A sequence folder. The camera is the config's, or the benchmark's own one named by the folder.
 
     `groundtruth.txt` is optional. Raises DatasetError for missing or unusable lists, and ConfigError if the camera is
     not known.
     """
-    pairs = _image_pairs(folder, config.depth_tolerance_s)
+    pairs = image_pairs(folder, config.expert.depth_tolerance_s)
     calibration = resolve(
         config,
         _freiburg_calibration(folder.resolve().name),
         "the folder's name has no freiburg1, freiburg2 or freiburg3 (fr1, fr2, fr3) to take it from; "
         "an ICL-NUIM folder needs dataset.format=icl",
     )
-    groundtruth = folder / "groundtruth.txt"
-    return FolderSource(
-        folder.resolve().name, pairs, calibration, config, groundtruth if groundtruth.exists() else None
-    )
+    frames = ImageFrames(pairs)
+    poses = poses_of_file(groundtruth_file(folder), frames.times_s)
+    return StoredRecording(folder.resolve().name, frames, calibration, DEPTH_UNITS, poses)
 
 
 def _freiburg_calibration(folder_name: str) -> Calibration | None:
@@ -50,7 +53,8 @@ def _freiburg_calibration(folder_name: str) -> Calibration | None:
     return _FREIBURG[found.group(1)] if found else None
 
 
-def _image_pairs(folder: Path, tolerance_s: float) -> list[ImagePair]:
+def image_pairs(folder: Path, tolerance_s: float) -> list[ImagePair]:
+    """What the lists of a sequence folder, or else its association file, name. Raises DatasetError."""
     lists = [folder / "rgb.txt", folder / "depth.txt"]
     missing = [path.name for path in lists if not path.is_file()]
     if not missing:
@@ -62,3 +66,13 @@ def _image_pairs(folder: Path, tolerance_s: float) -> list[ImagePair]:
         f"{folder}: found no {' and no '.join(missing)}; dataset.format=tum needs rgb.txt and depth.txt, "
         f"or one of {', '.join(ASSOCIATION_FILES)}"
     )
+
+
+def _recognises(folder: Path) -> bool:
+    if (folder / "rgb.txt").is_file() and (folder / "depth.txt").is_file():
+        return True
+    associations = find_association_file(folder)
+    return associations is not None and not has_image_numbers(associations)
+
+
+TUM = Layout("tum", "rgb.txt and depth.txt", _recognises, open_tum)

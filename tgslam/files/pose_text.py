@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import re
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,15 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.errors import TgslamError
-from tgslam.files.clock import ticks_per_second
+from tgslam.files.clock import ticks_per_second, unit_name
 from tgslam.files.tum_text import Row, read_rows, usable_pose_rows
 from tgslam.geometry import matrix_from_quat_wxyz, orthonormalized
 
+_log = logging.getLogger(__name__)
 _TUM_FIELDS = "timestamp tx ty tz qx qy qz qw"
 _KNOWN = (
     "also known are 12 numbers (KITTI's 3x4), 16 (4x4), either of them after a time, 4x4 matrices in four lines each, "
     "and columns that a header names"
 )
+_WIDTHS = (9, 12, 13, 16, 17)  # besides TUM's 8
 _NOT_ORTHONORMAL = 0.05  # largest entry of R^T R - I: rounded rotations are below, scaled and sheared ones above
 _POSE_ROLES = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 _TIMES = {"t", "time", "times", "timestamp", "timestamps", "stamp", "ts", "time_s", "timestamp_s", "sec", "seconds"}
@@ -62,6 +66,9 @@ def _table(
     error: type[TgslamError],
 ) -> PoseTable:
     width = values.shape[1]
+    if width == 9 and columns is None and np.array_equal(np.diff(values[:, 0]), np.ones(len(values) - 1)):
+        _log.warning("%s: its rows begin with a counter, which is passed over", path)
+        values, width = values[:, 1:], 8
     if columns is not None:
         values, width = values[:, columns], 8
     if width == 8 or not len(values):
@@ -70,11 +77,16 @@ def _table(
         times, (T_wc, usable) = None, _from_matrices(values)
     elif width == 13 or (width == 17 and np.allclose(values[:, 13:], (0, 0, 0, 1), atol=1e-6)):
         times, (T_wc, usable) = values[:, 0], _from_matrices(values[:, 1:])
+    elif width == 17:  # EuRoC's, with velocity and biases
+        times, (T_wc, usable) = values[:, 0], _from_quaternions(values[:, [0, 1, 2, 3, 5, 6, 7, 4]])
     else:
         raise error(f"{path}:{lines[0]}: expected 8 numbers ({_TUM_FIELDS}), found {width}; {_KNOWN}")
     if times is not None:
         usable = usable & np.isfinite(times)
-        times = times / ticks_per_second(times)
+        ticks = ticks_per_second(times)
+        if ticks != 1.0:
+            _log.warning("%s: its times are in %s, and are read so", path, unit_name(ticks))
+        times = times / ticks
     return PoseTable(lines, times, T_wc, usable)
 
 
@@ -116,15 +128,15 @@ def _read_array(path: Path, error: type[TgslamError]) -> NDArray[np.float64]:
 
 
 def _numbers(path: Path, rows: list[Row], error: type[TgslamError]) -> NDArray[np.float64]:
-    """[N, columns] of the rows; each must have as many as the first."""
-    count = len(rows[0].fields) if rows else 8
+    """[N, columns] of the rows; each must have as many as most."""
+    count = Counter(len(row.fields) for row in rows).most_common(1)[0][0] if rows else 8
     values = np.empty((len(rows), count))
-    for k, (line, fields) in enumerate(rows):
+    for k, (line, fields, text) in enumerate(rows):
         try:
             values[k] = [float(field) for field in fields]
         except ValueError:
-            expected = f"8 numbers ({_TUM_FIELDS})" if count == 8 or k == 0 else f"{count} numbers"
-            raise error(f"{path}:{line}: expected {expected}, found {' '.join(fields)[:60]!r}") from None
+            expected = f"{count} numbers, as in most rows" if count in _WIDTHS else f"8 numbers ({_TUM_FIELDS})"
+            raise error(f"{path}:{line}: expected {expected}, found {text[:60]!r}") from None
     return values
 
 

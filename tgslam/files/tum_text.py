@@ -20,6 +20,7 @@ class Row(NamedTuple):
 
     line: int  # counted from 1
     fields: list[str]
+    text: str  # the whole of it
 
 
 def read_rows(path: Path, error: type[TgslamError]) -> list[Row]:
@@ -34,7 +35,7 @@ def read_rows(path: Path, error: type[TgslamError]) -> list[Row]:
     for number, line in enumerate(text.splitlines(), start=1):
         fields = line.replace(",", " ").split()
         if fields and not fields[0].startswith("#"):
-            rows.append(Row(number, fields))
+            rows.append(Row(number, fields, line.strip()))
     return rows
 
 
@@ -45,7 +46,7 @@ def read_pose_rows(path: Path, error: type[TgslamError]) -> tuple[list[int], NDA
     """
     rows = read_rows(path, error)
     values = np.empty((len(rows), 8))
-    for k, (line, fields) in enumerate(rows):
+    for k, (line, fields, _) in enumerate(rows):
         try:
             values[k] = [float(field) for field in fields]
         except ValueError:

@@ -23,7 +23,7 @@ class Registration:
 
     def __init__(self, rays: NDArray[np.float64], T_colour_depth: Matrix4, colour: Camera) -> None:
         """rays: [H, W, 2] x/z and y/z that the pixels of the depth camera look along. T_colour_depth: [4, 4]."""
-        self._camera = colour
+        self._camera, self.stored_shape = colour, (rays.shape[0], rays.shape[1])
         self._rays = runtime.to_device(rays)
         self._T_cd = runtime.to_device(T_colour_depth[:3])
         self._intrinsics = runtime.to_device(colour.intrinsics)
@@ -31,7 +31,7 @@ class Registration:
 
     def __call__(self, depth_m: FloatImage) -> FloatImage:
         """Depth [H, W] m of the depth camera, 0 = none -> [h, w] of the colour camera, a new array on the host."""
-        placed = runtime.empty((*require("depth_m", depth_m, tuple(self._rays.shape[:2])).shape, 3))
+        placed = runtime.empty((*require("depth_m", depth_m, self.stored_shape).shape, 3))
         depth, agreement = runtime.to_device(depth_m), (USUAL_NOISE.per_m2, _TOLERANCE_SIGMAS, self._slope)
         kernels.place(depth, self._rays, self._T_cd, self._intrinsics, placed)
         surfaces, points = (runtime.empty(self._camera.shape, np.int32) for _ in range(2))
