@@ -18,15 +18,12 @@ def ticks_per_second(times: ArrayLike) -> float:
     """
     values = np.asarray(times, np.float64)
     values = values[np.isfinite(values)]
-    latest = float(values.max(initial=0.0))
-    since_1970 = next((unit for least, unit in _EPOCHS if latest > least), None)
-    if since_1970 is not None:
-        return since_1970
     gaps = np.diff(np.unique(values))
     spacing = float(np.median(gaps)) if len(gaps) else 0.0
-    if spacing < _LEAST_SPACING:
-        return 1.0
-    return next((unit for unit in sorted(_UNITS) if spacing / unit <= _SLOWEST_S), 1.0)
+    if spacing >= _LEAST_SPACING:
+        return next((unit for unit in sorted(_UNITS) if spacing / unit <= _SLOWEST_S), 1.0)
+    earliest = float(values.min()) if len(values) else 0.0
+    return next((unit for least, unit in _EPOCHS if earliest > least), 1.0)
 
 
 def unit_name(ticks: float) -> str:
