@@ -15,7 +15,7 @@ from tgslam.cli import main
 from tgslam.config.input_settings import SyntheticConfig
 from tgslam.config.loader import load
 from tgslam.conversion.converter import convert
-from tgslam.conversion.layouts import LAYOUTS
+from tgslam.conversion.targets import LAYOUTS
 from tgslam.datasets import open_source
 from tgslam.datasets.known_poses import KnownPoses
 from tgslam.errors import DatasetError, FrameError, OutputError

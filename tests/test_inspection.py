@@ -154,4 +154,4 @@ def test_the_command_prints_what_the_recording_is(tmp_path: Path, capsys: pytest
     assert main(["probe", "--input", str(tmp_path), *camera]) == 0
     output, log = capsys.readouterr()
     assert "format tum" in output and "3, 0 of them unreadable" in output and "10.00 frames/s" in output
-    assert "its clock counts in nanoseconds" in log
+    assert "in nanoseconds" in log

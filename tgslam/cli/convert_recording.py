@@ -12,7 +12,7 @@ from tgslam.cli import engine
 from tgslam.cli.inputs import add_input_options, open_frames, parse_frames, resolve_config
 from tgslam.config.loader import dump
 from tgslam.conversion.converter import convert
-from tgslam.conversion.layouts import LAYOUTS
+from tgslam.conversion.targets import LAYOUTS
 from tgslam.datasets.known_poses import OF_THE_RECORDING, open_poses
 from tgslam.output.console import error_console
 from tgslam.output.progress import count_progress

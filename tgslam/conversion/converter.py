@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from tgslam.conversion.journal import Journal
-from tgslam.conversion.layouts import LAYOUTS, Layout, Written
+from tgslam.conversion.targets import LAYOUTS, Layout, Written
 from tgslam.datasets.source import RgbdSource
 from tgslam.errors import DatasetError, FrameError, OutputError
 from tgslam.files.atomic import write_text

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tgslam.conversion.layouts import Written
+from tgslam.conversion.targets import Written
 from tgslam.errors import OutputError
 from tgslam.files.atomic import write_text
 
