@@ -238,6 +238,13 @@ def test_depth_of_a_concentric_camera_of_its_own_is_looked_up_there(folder: Path
         FolderSource(replace(recording, depth_camera=smaller(own)), CONFIG).read(0)
 
 
+@pytest.mark.parametrize("fx", [0.0, -5.0, np.nan, np.inf])
+def test_a_depth_camera_that_cannot_be(folder: Path, fx: float) -> None:
+    own = DepthCamera(Calibration(fx, 20.0, 15.5, 11.0, (), (W, H)), np.eye(4))
+    with pytest.raises(ConfigError, match="clip: no depth camera has fx"):
+        FolderSource(replace(opened(folder)._recording, depth_camera=own), CONFIG)
+
+
 def smaller(own: DepthCamera) -> DepthCamera:
     return replace(own, calibration=replace(own.calibration, size=(20, 20)))
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tgslam.camera import Camera
 from tgslam.config.input_settings import DatasetConfig, DepthCameraConfig
 from tgslam.datasets.calibration import DISTORTION_LENGTHS, Calibration, DepthCamera
+from tgslam.datasets.stored import StoredRecording
 from tgslam.errors import ConfigError
 from tgslam.geometry import matrix_from_quat_wxyz, orthonormalized
 from tgslam.types import FloatImage, Matrix4
@@ -43,18 +44,20 @@ def register_to(colour: Camera, depth: DepthCamera, size: tuple[int, int]) -> Re
     return Registration(rays_of(depth.calibration, *size), depth.T_colour_depth, colour)
 
 
-def own_depth_camera(
-    config: DatasetConfig, recorded: DepthCamera | None, colour: Calibration, size: tuple[int, int]
-) -> DepthCamera | None:
+def own_depth_camera(config: DatasetConfig, recording: StoredRecording, size: tuple[int, int]) -> DepthCamera | None:
     """The depth camera that the settings name, else that of the recording; None: depth shows what colour shows.
 
-    colour: of its stored images. size: of the depth images, (width, height) px. Raises ConfigError for a depth camera
-    that cannot be.
+    size: of the depth images, (width, height) px. Raises ConfigError for a depth camera that cannot be.
     """
-    found = recorded
+    found = recording.depth_camera
     if config.depth_camera != DepthCameraConfig():
         found = configured_depth_camera(config.depth_camera, size)
-    if found is not None and colour.flips_rows:
+    elif found is not None:
+        own = found.calibration
+        if not (np.isfinite(own.matrix).all() and own.fx > 0 and own.fy > 0):
+            numbers = f"{own.fx:g}, {own.fy:g}, {own.cx:g}, {own.cy:g}"
+            raise ConfigError(f"{recording.name}: no depth camera has fx, fy, cx, cy of {numbers} px")
+    if found is not None and recording.calibration.flips_rows:
         raise ConfigError("a depth camera of its own does not go with a negative dataset.fy, whose images are flipped")
     return found
 

@@ -50,10 +50,12 @@ class FolderSource:
         )
         self._told_size = False  # that depth is of another one
         self._resizer = None if config.width in (0, width) else Resizer(self._stored, config.width, recording.name)
-        own = own_depth_camera(config, recording.depth_camera, calibration, depth_size)
+        own = own_depth_camera(config, recording, depth_size)
         straight = own is not None and own.is_concentric and not own.calibration.distortion
         self._resampler = DepthResampler(own.calibration, self.camera) if own and straight else None
-        self._registration = register_to(self.camera, own, depth_size) if own and not straight else None
+        self._registration = (
+            register_to(self.camera, own, own.calibration.size or depth_size) if own and not straight else None
+        )
         if own is None:
             _require_same_shape(recording.name, (height, width), depth_size)
 

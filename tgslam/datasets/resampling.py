@@ -13,6 +13,7 @@ from tgslam.camera import Camera
 from tgslam.datasets.calibration import Calibration
 from tgslam.errors import ConfigError
 
+_FAR_PX = 1e6  # beyond any image
 _EDGE = 0.05  # relative depth step between neighbours beyond which they are two surfaces
 
 
@@ -25,7 +26,9 @@ class Resampling:
 
     def __init__(self, columns: NDArray[Any], rows: NDArray[Any]) -> None:
         """columns [W], rows [H]: px of the image that is looked up."""
-        self._columns, self._rows = columns.astype(np.float32), rows.astype(np.float32)
+        self._columns, self._rows = (
+            np.clip(places, -_FAR_PX, _FAR_PX).astype(np.float32) for places in (columns, rows)
+        )
 
     def __call__(self, depth: NDArray[Any]) -> NDArray[Any]:
         """[h, w] of any kind of number -> [H, W] of the same."""
