@@ -64,7 +64,7 @@ class FakeSystem:
         self.finished = False
         self.lost, self.refused, self.on_frame = lost, refused, on_frame
 
-    def process_frame(self, frame: Frame) -> FrameReport:
+    def process_frame(self, frame: Frame, T_wc: Matrix4 | None = None) -> FrameReport:
         self.on_frame(frame.index)
         if frame.index in self.refused:
             raise FrameError(f"frame {frame.index} has no depth")

@@ -195,6 +195,31 @@ def test_principal_point_outside_the_image_is_warned_of(folder: Path, caplog: py
     assert "outside its 64x48 images" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("units", "scale", "message"),
+    [
+        (2000, 1.0, r"2 m in millimetres, which is dataset\.depth_scale=1000"),
+        (20000, 1.0, r"4 m in units of the TUM benchmark, which is dataset\.depth_scale=5000"),
+        (2, 1e6, "check dataset.depth_scale$"),
+        (0, 1000.0, "no measurement at all"),
+    ],
+)
+def test_a_depth_scale_that_leaves_nothing_names_a_likelier_one(
+    folder: Path, units: int, scale: float, message: str
+) -> None:
+    write_image(folder / "depth/0.png", np.full((H, W), units, np.uint16))
+    with pytest.raises(FrameError, match=message):
+        opened(folder, replace(TUM, depth_scale=scale)).read(0)
+
+
+@pytest.mark.parametrize(("cx", "cy", "size"), [(47.5, 35.5, "96x72"), (15.5, 11.5, "32x24"), (31.5, 11.5, None)])
+def test_intrinsics_of_another_size_are_warned_of(
+    folder: Path, caplog: pytest.LogCaptureFixture, cx: float, cy: float, size: str | None
+) -> None:
+    opened(folder, replace(TUM, cx=cx, cy=cy))
+    assert (f"likely for images of {size}, but these are 64x48" in caplog.text) == (size is not None)
+
+
 def test_unknown_camera_names_the_keys_to_set(folder: Path) -> None:
     with pytest.raises(ConfigError, match=r"dataset\.cx.*freiburg1"):
         opened(folder, replace(TUM, cx=0.0))

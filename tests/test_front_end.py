@@ -159,7 +159,13 @@ class FakeTracker:
         self.accepted += 1
 
     def track(
-        self, frame: object, gaussians: object, T_cw: NDArray[np.float64], exposure: Exposure, prior: object = None
+        self,
+        frame: object,
+        gaussians: object,
+        T_cw: NDArray[np.float64],
+        exposure: Exposure,
+        prior: object = None,
+        firm: bool = False,
     ) -> TrackingResult:
         self.asked.append(round(x_of(T_cw), 2))
         ends = [x for x in self.drawn_to if abs(x - x_of(T_cw)) < 0.3]
@@ -180,7 +186,7 @@ def tracked(
     drawn_to: list[float], predicted_m: float, latest_m: float = 0.0, number: int = 0
 ) -> tuple[TrackingResult, FakeTracker]:
     """Of a frame that is predicted somewhere along x; a keyframe shows frame 0, where x is 0."""
-    front_end, fake = FrontEnd(source().camera, CONFIG.tracking, CONFIG.loss), FakeTracker(drawn_to)
+    front_end, fake = FrontEnd(source().camera, CONFIG.tracking, CONFIG.loss, CONFIG.poses), FakeTracker(drawn_to)
     front_end.tracker = fake  # type: ignore[assignment]
     there = inverse(source().pose(0))
     front_end._motion.update(0.0, at(predicted_m) @ there, 1e12 * np.eye(6))

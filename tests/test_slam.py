@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tgslam.adaptation import Slam as AdaptiveSlam
 from tgslam.config.input_settings import SyntheticConfig
 from tgslam.config.loader import load
 from tgslam.config.schema import Config
@@ -18,7 +19,7 @@ from tgslam.errors import FrameError
 from tgslam.evaluation.held_out import view_metrics
 from tgslam.evaluation.protocol import held_out_poses
 from tgslam.evaluation.trajectory import ate
-from tgslam.geometry import inverse
+from tgslam.geometry import inverse, se3_exp
 from tgslam.ops.rasterize import Rasterizer
 from tgslam.slam import Slam
 from tgslam.types import Frame, FrameReport, FrameStatus, Gaussians, Trajectory
@@ -348,3 +349,61 @@ def test_a_run_with_every_kind_of_closure_repeats_bit_for_bit(room: RgbdSource, 
     np.testing.assert_array_equal(first.trajectory().T_wc, second.trajectory().T_wc)
     for field in fields(Gaussians):
         np.testing.assert_array_equal(getattr(first.gaussians(), field.name), getattr(second.gaussians(), field.name))
+
+
+# --- poses that the user knows ---
+
+FAST = ("mapping.iterations=2", "mapping.final_iterations=2", "tracking.alignment_steps=[4, 6]")
+KNOWN_SCENE = SyntheticSource(SyntheticConfig(frames=720, width=64, height=48), seed=0)
+KNOWN_FRAMES = (0, 12, 24, 36)
+ELSEWHERE = se3_exp([0.3, -0.2, 0.5, 4.0, -2.0, 1.0])  # another world than that of the first camera
+
+
+def fast_config(*more: str) -> Config:
+    return load(None, [*FAST, "planes.enabled=false", *more])
+
+
+def known_poses(noise_m: float = 0.0) -> list[np.ndarray]:
+    rng = np.random.default_rng(0)
+    return [ELSEWHERE @ KNOWN_SCENE.pose(k) @ se3_exp([0, 0, 0, *(noise_m * rng.normal(size=3))]) for k in KNOWN_FRAMES]
+
+
+def played_with(config: Config, known: list[np.ndarray | None]) -> tuple[AdaptiveSlam, list[FrameStatus]]:
+    slam = AdaptiveSlam(KNOWN_SCENE.camera, config)
+    reports = [slam.process_frame(KNOWN_SCENE.read(k), T_wc) for k, T_wc in zip(KNOWN_FRAMES, known, strict=True)]
+    return slam, [report.status for report in reports]
+
+
+def test_fixed_poses_stay_as_they_are_and_the_map_is_in_their_world() -> None:
+    given = known_poses()
+    slam, statuses = played_with(fast_config("poses.use=fixed", "keyframes.max_translation=0"), given)
+    np.testing.assert_allclose(slam.trajectory().T_wc, given, atol=1e-9)
+    assert statuses == [FrameStatus.INITIAL] + [FrameStatus.TRACKED] * 3
+    assert len(slam.keyframe_indices()) == 4
+    slam.finish()
+    np.testing.assert_allclose(slam.keyframe_trajectory().T_wc, given, atol=1e-9)
+    away = (slam.gaussians().mean.astype(float) - ELSEWHERE[:3, 3]) @ ELSEWHERE[:3, :3]  # in the room
+    assert np.quantile(KNOWN_SCENE.surface_distance_m(away), 0.9) < 0.05
+
+
+def test_a_prior_is_where_tracking_starts_and_no_more_than_its_deviations_say() -> None:
+    given = known_poses(noise_m=0.02)
+    slam, statuses = played_with(fast_config("poses.use=prior", "poses.sigma_m=0.02"), given)
+    assert FrameStatus.LOST not in statuses
+    truth = Trajectory(np.array(KNOWN_FRAMES) / 30.0, np.stack([KNOWN_SCENE.pose(k) for k in KNOWN_FRAMES]))
+    raw = Trajectory(truth.timestamps_s, np.stack(given))
+    assert ate(slam.trajectory(), truth, 0.001).rmse_m < 0.5 * ate(raw, truth, 0.001).rmse_m
+    np.testing.assert_allclose(slam.trajectory().T_wc[0], given[0], atol=1e-12)
+
+
+def test_what_is_needed_and_not_known_is_an_error_of_that_frame() -> None:
+    fixed, frame = AdaptiveSlam(KNOWN_SCENE.camera, fast_config("poses.use=fixed")), KNOWN_SCENE.read(0)
+    for config, T_wc, message in (
+        (fast_config("poses.use=fixed"), None, "pose is not known, which poses.use=fixed needs"),
+        (fast_config("poses.use=prior"), None, "pose is not known"),
+        (fast_config(), np.eye(4), "poses.use is none"),
+        (fast_config("poses.use=fixed"), 2.0 * np.eye(4), "no rigid motion"),
+    ):
+        with pytest.raises(FrameError, match=message):
+            AdaptiveSlam(KNOWN_SCENE.camera, config).process_frame(frame, T_wc)
+    assert len(fixed.trajectory()) == 0

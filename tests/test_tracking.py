@@ -762,6 +762,22 @@ def test_a_world_that_moves_takes_the_prediction_with_it_and_not_the_velocity():
     np.testing.assert_allclose(motion.predict(0.2), moved(0.2) @ inverse(correction), atol=1e-9)
 
 
+@pytest.mark.parametrize("sigma", [1e-6, 10.0])
+def test_a_firm_prior_counts_beside_pixels_by_its_deviations(sigma):
+    scene, start = Planes((WALL, SIDE, FLOOR)), se3_exp([0.0, 0.0, 0.0, 0.01, -0.005, 0.01])
+    found = exact_tracker(scene).track(scene.frame(np.eye(4)), None, start, Exposure(), np.eye(6) / sigma**2, firm=True)
+    np.testing.assert_allclose(found.T_cw, start if sigma < 1.0 else np.eye(4), atol=1e-6 if sigma < 1.0 else 2e-3)
+
+
+def test_at_a_pose_that_is_known_the_exposure_is_fitted_where_it_is_asked_for():
+    scene = Planes((WALL, SIDE, FLOOR))
+    dim, tracker = with_exposure(scene.frame(np.eye(4)), 0.8), exact_tracker(scene, changed(CONFIG, exposure="gain"))
+    fitted = tracker.assess(dim, None, np.eye(4), Exposure(), fits_exposure=True)
+    assert fitted.exposure.gain == pytest.approx(1.25, rel=0.01)
+    np.testing.assert_array_equal(fitted.T_cw, np.eye(4))
+    assert tracker.assess(dim, None, np.eye(4), Exposure()).exposure == Exposure()
+
+
 def test_a_prior_holds_the_directions_in_which_pixels_say_little_and_no_others():
     """Before a blank wall: it tells distance and tilt, and nothing of the rest."""
     scene = Planes((WALL,), contrast=0.0)

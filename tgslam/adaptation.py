@@ -10,9 +10,11 @@ import numpy as np
 from tgslam.boundary import FrameCheck
 from tgslam.camera import USUAL_NOISE, Camera
 from tgslam.config.schema import Config
+from tgslam.errors import FrameError
+from tgslam.geometry import is_motion
 from tgslam.sensing import UNUSUAL, learn_noise, likelier_scale, median_depth_m, reach_m, unit_of
 from tgslam.slam import Slam as RoomSlam
-from tgslam.types import Frame, FrameReport, Gaussians, Plane, Trajectory
+from tgslam.types import Frame, FrameReport, Gaussians, Matrix4, Plane, Trajectory
 
 _log = logging.getLogger(__name__)
 _USUAL_SCALE = 5000.0  # units of depth in a metre where the settings leave them open: the TUM benchmark's
@@ -28,17 +30,21 @@ class Slam:
     def __init__(self, camera: Camera, config: Config) -> None:
         self.camera, self.config = camera, config
         self._check, self._started = FrameCheck(camera), False
-        self._unit_m, self._slam = 1.0, RoomSlam(camera, config)
+        self._unit_m, self._slam = 1.0, RoomSlam(camera, _held(config))
 
-    def process_frame(self, frame: Frame) -> FrameReport:
+    def process_frame(self, frame: Frame, T_wc: Matrix4 | None = None) -> FrameReport:
         """Estimate the frame's pose and, if it shows something new, map it. Frames come in order of time.
 
-        Raises FrameError, with nothing changed, for a frame with next to no depth or of another size than the camera's.
+        T_wc: the pose [4, 4], camera to world, where it is known beforehand; `poses.use` says what for. The world is
+        then theirs. Raises FrameError, with nothing changed, for a frame with next to no depth or of another size than
+        the camera's, and for one whose pose is needed and not known.
         """
+        known = self._known(frame, T_wc)
         if self._started:
-            return self._report_in_metres(self._slam.process_frame(self._in_units(frame)))
+            return self._report_in_metres(self._slam.process_frame(self._in_units(frame), self._pose_in_units(known)))
         self._adapt(self._check(frame))
-        report = self._report_in_metres(self._slam.process_frame(self._in_units(frame)))
+        first = self._slam.process_frame(self._in_units(frame), self._pose_in_units(known))
+        report = self._report_in_metres(first)
         self._started = True
         per_m2 = self._slam.config.loss.noise.per_m2 / self._unit_m
         settled = {"depth_sigma_per_m2": per_m2, "unit_m": self._unit_m}
@@ -82,8 +88,29 @@ class Slam:
         if config.unit_m is None:
             _warn_of_scale(config.dataset.depth_scale or _USUAL_SCALE, found, reach, self._unit_m)
         loss = dataclasses.replace(config.loss, depth_sigma_per_m2=per_unit)
-        if loss.noise != self._slam.config.loss.noise:
-            self._slam = RoomSlam(self.camera, dataclasses.replace(config, loss=loss))
+        poses = dataclasses.replace(config.poses, sigma_m=config.poses.sigma_m / self._unit_m)
+        if loss.noise != self._slam.config.loss.noise or (poses.use == "prior" and self._unit_m != 1.0):
+            self._slam = RoomSlam(self.camera, dataclasses.replace(_held(config), loss=loss, poses=poses))
+
+    def _known(self, frame: Frame, T_wc: Matrix4 | None) -> Matrix4 | None:
+        """The pose, checked. In `fixed`, every frame needs one; else the first one does, as the world is theirs."""
+        use = self.config.poses.use
+        if T_wc is None:
+            if use == "fixed" or (use == "prior" and not self._started):
+                raise FrameError(f"frame {frame.index}: its pose is not known, which poses.use={use} needs")
+            return None
+        if use == "none":
+            raise FrameError(f"frame {frame.index}: a pose is given, but poses.use is none; set it to fixed or prior")
+        if np.shape(T_wc) != (4, 4) or not is_motion(T_wc):
+            raise FrameError(f"frame {frame.index}: its known pose is no rigid motion [4, 4]")
+        return np.asarray(T_wc, np.float64)
+
+    def _pose_in_units(self, T_wc: Matrix4 | None) -> Matrix4 | None:
+        if T_wc is None or self._unit_m == 1.0:
+            return T_wc
+        T_wc = T_wc.copy()
+        T_wc[:3, 3] /= self._unit_m
+        return T_wc
 
     def _in_units(self, frame: Frame) -> Frame:
         """The frame with depth in units, checked while it still is in metres."""
@@ -103,6 +130,18 @@ class Slam:
         T_wc = report.T_wc.copy()
         T_wc[:3, 3] *= self._unit_m
         return dataclasses.replace(report, T_wc=T_wc)
+
+
+def _held(config: Config) -> Config:
+    """The settings without what would move keyframes whose poses are known."""
+    if config.poses.use != "fixed":
+        return config
+    return dataclasses.replace(
+        config,
+        mapping=dataclasses.replace(config.mapping, refine_poses=False),
+        closures=dataclasses.replace(config.closures, enabled=False),
+        loops=dataclasses.replace(config.loops, enabled=False),
+    )
 
 
 def _noise_per_m2(first: Frame) -> float:

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 _SMALL = 1e-8
+_ROUNDED = 1e-3  # largest entry of R^T R - I of a rotation that was printed with few digits
 
 
 def hat(vector: ArrayLike) -> Array:
@@ -69,6 +70,16 @@ def inverse(T: ArrayLike) -> Array:
     result[..., :3, 3] = -(Rt @ T[..., :3, 3:])[..., 0]
     result[..., 3, 3] = 1.0
     return result
+
+
+def is_motion(T: ArrayLike) -> bool:
+    """Whether [4, 4] is a rigid motion, but for rounding: finite, a rotation, no mirror, last row 0 0 0 1."""
+    T = np.asarray(T, np.float64)
+    if not np.isfinite(T).all():
+        return False
+    R = T[:3, :3]
+    turned = bool(np.abs(R.T @ R - np.eye(3)).max() < _ROUNDED) and float(np.linalg.det(R)) > 0.0
+    return turned and bool(np.array_equal(T[3], (0.0, 0.0, 0.0, 1.0)))
 
 
 def orthonormalized(T: ArrayLike) -> Array:

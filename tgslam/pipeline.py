@@ -19,7 +19,7 @@ from tgslam.output.progress import FrameObserver
 from tgslam.output.run_folder import RunFolder
 from tgslam.output.run_results import Found, write_results
 from tgslam.output.trajectory_io import write_trajectory
-from tgslam.types import Frame, FrameReport, FrameStatus
+from tgslam.types import Frame, FrameReport, FrameStatus, Matrix4
 
 _log = logging.getLogger(__name__)
 _MAX_WARNINGS = 5  # skipped or lost frames that are named; log.jsonl has all
@@ -28,11 +28,26 @@ _MAX_WARNINGS = 5  # skipped or lost frames that are named; log.jsonl has all
 class System(Found, Protocol):
     """What a run needs of the SLAM system."""
 
-    def process_frame(self, frame: Frame) -> FrameReport:
-        """Take the next frame of the sequence. Raises FrameError, unchanged, for one that it cannot use."""
+    def process_frame(self, frame: Frame, T_wc: Matrix4 | None = None) -> FrameReport:
+        """Take the next frame of the sequence, with its pose [4, 4] where the user knows it.
+
+        Raises FrameError, unchanged, for one that it cannot use.
+        """
 
     def finish(self) -> None:
         """Refine the map once all frames are in."""
+
+
+class Poses(Protocol):
+    """Poses that the user knows."""
+
+    def at(self, index: int, timestamp_s: float) -> Matrix4 | None:
+        """T_wc [4, 4] of a frame, None where it is not known."""
+
+
+class _NoPoses:
+    def at(self, index: int, timestamp_s: float) -> Matrix4 | None:
+        return None
 
 
 @dataclass(frozen=True)
@@ -51,6 +66,7 @@ def run(
     system: System,
     folder: RunFolder,
     *,
+    poses: Poses | None = None,
     read_ahead: bool = True,
     refine: bool = True,
     observer: FrameObserver = lambda report: None,
@@ -58,6 +74,7 @@ def run(
 ) -> Summary:
     """Feed every frame to `system`, refine, and write trajectories, planes and map.ply; log.jsonl grows on.
 
+    poses: of the frames, where the user knows them.
     read_ahead: decode the next frame in a thread meanwhile; only for a source that does not use the kernels itself.
     refine: call `finish`; never done after a request to stop.
     stop_requested: asked before each frame; when true, the run ends there and writes what it has.
@@ -65,7 +82,7 @@ def run(
     poses and the map up to there are kept as partial_trajectory.txt and partial_map.ply where that is possible.
     """
     try:
-        summary = _frame_loop(source, system, folder, read_ahead, observer, stop_requested)
+        summary = _frame_loop(source, system, folder, poses or _NoPoses(), read_ahead, observer, stop_requested)
         _check_tracked(source.name, summary.reports)
         if refine and not summary.interrupted:
             start_s = time.perf_counter()
@@ -82,6 +99,7 @@ def _frame_loop(
     source: RgbdSource,
     system: System,
     folder: RunFolder,
+    poses: Poses,
     read_ahead: bool,
     observer: FrameObserver,
     stop_requested: Callable[[], bool],
@@ -95,7 +113,7 @@ def _frame_loop(
             if stop_requested():
                 interrupted = True
                 break
-            reports.append(_report(position, item, system, gaussians=reports[-1].gaussians if reports else 0))
+            reports.append(_report(position, item, system, poses, gaussians=reports[-1].gaussians if reports else 0))
             log.append(reports[-1])
             observer(reports[-1])
             _warn(reports)
@@ -104,12 +122,12 @@ def _frame_loop(
     return Summary(reports, loop_s=loop_s, finish_s=0.0, read_s=read_s, interrupted=interrupted)
 
 
-def _report(position: int, item: Frame | FrameError, system: System, gaussians: int) -> FrameReport:
+def _report(position: int, item: Frame | FrameError, system: System, poses: Poses, gaussians: int) -> FrameReport:
     """What became of one frame. One that could not be read has no time, and its position in the source as its index."""
     if isinstance(item, FrameError):
         return _skipped(position, math.nan, item, gaussians)
     try:
-        return system.process_frame(item)
+        return system.process_frame(item, poses.at(item.index, item.timestamp_s))
     except FrameError as error:
         return _skipped(item.index, item.timestamp_s, error, gaussians)
 

@@ -17,7 +17,7 @@ from tgslam.preparation import Preparation
 from tgslam.record import FrameRecord
 from tgslam.tracking.front_end import FrontEnd
 from tgslam.tracking.result import TrackingResult
-from tgslam.types import Exposure, Frame, FrameReport, FrameStatus, Gaussians, Plane, Trajectory
+from tgslam.types import Frame, FrameReport, FrameStatus, Gaussians, Matrix4, Plane, Trajectory
 
 
 class Slam:
@@ -27,27 +27,27 @@ class Slam:
         noise, rng = config.loss.noise, np.random.default_rng(config.seed)
         structure = config.structure if config.planes.enabled else None
         self.camera, self.config, self.map = camera, config, Map(camera, noise, config.loops, config.planes)
-        self.front_end = FrontEnd(camera, config.tracking, config.loss)
+        self.front_end = FrontEnd(camera, config.tracking, config.loss, config.poses)
         self._prepare, self._cues = Preparation(camera, noise), Cues(config.keyframes, config.planes)
         self._planes, self._closing = assembly.plane_observer(camera, config), assembly.graph_closing(camera, config)
         self._refinement = WindowRefinement(self.map, camera, config.mapping, config.loss, rng, structure)
         self._growth = Growth(camera, config.mapping, config.seeding, noise, rng.spawn(1)[0], structure)
         self._poses = FramePoses(self.map.keyframes)
 
-    def process_frame(self, frame: Frame) -> FrameReport:
+    def process_frame(self, frame: Frame, T_wc: Matrix4 | None = None) -> FrameReport:
         """Estimate the frame's pose and, if it shows something new, map it. Frames come in order of time.
 
-        Raises FrameError, with nothing changed, for a frame with next to no depth or of another size than the camera's.
+        T_wc: the pose as it is known, if it is. Raises FrameError, with nothing changed, for a frame with next to no
+        depth or of another size than the camera's.
         """
         record = FrameRecord(frame)
         with record.stage("prepare"):
             frame = self._prepare(frame)
         if not self.map.keyframes:
-            result = TrackingResult(np.eye(4), Exposure(), np.eye(6), lost=False)
-            status, cue = FrameStatus.INITIAL, "first frame"
+            result, status, cue = self.front_end.begin(T_wc), FrameStatus.INITIAL, "first frame"
         else:
             with record.stage("track"):  # section 3.1, Eqs. 10 to 13
-                result = self.front_end.track(frame, self.map, self._poses.latest_T_cw())
+                result = self.front_end.track(frame, self.map, self._poses.latest_T_cw(), T_wc)
             with record.stage("select"):  # section 3.1, the cues
                 cue = "" if result.lost else self._keyframe_cue(frame, result)
             status = FrameStatus.LOST if result.lost else FrameStatus.TRACKED

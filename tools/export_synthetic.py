@@ -6,14 +6,11 @@ import argparse
 import sys
 from pathlib import Path
 
-from tgslam.camera import Camera
 from tgslam.config.input_settings import SyntheticConfig
 from tgslam.config.loader import load
+from tgslam.conversion.converter import convert
 from tgslam.datasets.built_in import SyntheticSource
-from tgslam.errors import OutputError, TgslamError
-from tgslam.files.atomic import write_text
-from tgslam.output.pictures import DEPTH_SCALE, write_colour, write_depth
-from tgslam.output.trajectory_io import write_trajectory
+from tgslam.errors import TgslamError
 from tgslam.synthetic.scenes import SCENES
 
 CAMERA_FILE = "camera.yaml"
@@ -23,33 +20,9 @@ def export(source: SyntheticSource, folder: Path) -> None:
     """Write every frame of `source` into `folder`: rgb/, depth/ (16-bit PNG), rgb.txt, depth.txt, groundtruth.txt.
 
     camera.yaml beside them is the config that reads the folder back. Raises OutputError if the folder holds anything
-    already, or if a file cannot be written.
+    else already, or if a file cannot be written.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise OutputError(f"{folder} exists and is not an empty folder; name another, or remove it first")
-    lists = {"rgb": "# timestamp filename\n", "depth": "# timestamp filename\n"}
-    try:
-        for kind in lists:
-            (folder / kind).mkdir(parents=True, exist_ok=True)
-        for index in range(len(source)):
-            frame = source.read(index)
-            time_text = f"{frame.timestamp_s:.6f}"
-            write_colour(folder / "rgb" / f"{time_text}.png", frame.colour)
-            write_depth(folder / "depth" / f"{time_text}.png", frame.depth_m)
-            for kind in lists:
-                lists[kind] += f"{time_text} {kind}/{time_text}.png\n"
-        for kind, text in lists.items():
-            write_text(folder / f"{kind}.txt", text)
-        write_text(folder / CAMERA_FILE, _camera_yaml(source.camera))
-    except OSError as error:
-        raise OutputError(f"{folder}: {error.strerror or error}") from error
-    write_trajectory(folder / "groundtruth.txt", source.groundtruth())
-
-
-def _camera_yaml(camera: Camera) -> str:
-    lines = ["dataset:", "  format: tum", f"  depth_scale: {DEPTH_SCALE}"]
-    lines += [f"  {key}: {getattr(camera, key)!r}" for key in ("fx", "fy", "cx", "cy")]
-    return "\n".join(lines) + "\n"
+    convert(source, folder, "tum", trajectory=source.groundtruth())
 
 
 def _parser() -> argparse.ArgumentParser:

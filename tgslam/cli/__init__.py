@@ -11,7 +11,9 @@ from collections.abc import Sequence
 
 from tgslam import __version__
 from tgslam.cli import benchmark as bench
+from tgslam.cli import convert_recording as convert
 from tgslam.cli import doctor, evaluate, render, run
+from tgslam.cli import probe_recording as probe
 from tgslam.cli.options import add_log_options
 from tgslam.errors import TgslamError
 from tgslam.output.console import error_console, set_up_logging
@@ -56,7 +58,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"tgslam {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    for module in (run, evaluate, render, bench, doctor):
+    for module in (run, evaluate, render, probe, convert, bench, doctor):
         command = module.add_parser(commands)
         add_log_options(command)
         command.set_defaults(execute=module.execute)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tgslam.cli import engine
-from tgslam.cli.inputs import can_read_ahead, open_frames
+from tgslam.cli.inputs import can_read_ahead, groundtruth_to_compare, open_frames
 from tgslam.cli.summary import print_metrics
 from tgslam.config.schema import Config
 from tgslam.datasets.groundtruth import read_groundtruth
@@ -41,7 +41,7 @@ def execute(args: argparse.Namespace) -> int:
     record, config = folder.read_record(), folder.read_config()
     device = engine.start_device(args.device)
     source = _open_source(config, record, required=args.groundtruth is None)
-    groundtruth = _groundtruth(args.groundtruth, source)
+    groundtruth = _groundtruth(args.groundtruth, config, source)
     earlier = folder.read_metrics()
     found = evaluate_run(
         folder,
@@ -49,7 +49,7 @@ def execute(args: argparse.Namespace) -> int:
         source,
         groundtruth,
         lambda gaussians, planes: engine.make_show(record.camera, gaussians, planes, config),
-        read_ahead=can_read_ahead(config),
+        read_ahead=can_read_ahead(source),
     )
     if args.groundtruth is not None and found["ate_rmse_all_cm"] is None:
         raise EvaluationError(f"{args.groundtruth}: cannot be compared with {folder.trajectory}; see the warning above")
@@ -61,10 +61,10 @@ def execute(args: argparse.Namespace) -> int:
     return 0
 
 
-def _groundtruth(file: Path | None, source: RgbdSource | None) -> Trajectory | None:
+def _groundtruth(file: Path | None, config: Config, source: RgbdSource | None) -> Trajectory | None:
     if file is not None:
         return read_groundtruth(file)
-    return None if source is None else source.groundtruth()
+    return None if source is None else groundtruth_to_compare(config, source)
 
 
 def _open_source(config: Config, record: RunRecord, required: bool) -> RgbdSource | None:

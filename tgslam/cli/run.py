@@ -12,11 +12,21 @@ from typing import Any
 
 from tgslam import __version__, pipeline
 from tgslam.cli import engine
-from tgslam.cli.inputs import can_read_ahead, open_frames, parse_frames, resolve_config
+from tgslam.cli.inputs import (
+    add_input_options,
+    can_read_ahead,
+    groundtruth_to_compare,
+    known_poses,
+    open_frames,
+    parse_frames,
+    resolve_config,
+    settings_of,
+)
 from tgslam.cli.interrupt import StopRequest
 from tgslam.cli.options import natural
 from tgslam.cli.summary import print_metrics
 from tgslam.config.schema import Config
+from tgslam.datasets.edge_alignment import warn_of_misalignment
 from tgslam.datasets.source import RgbdSource
 from tgslam.errors import TgslamError
 from tgslam.evaluation.run_metrics import complete, evaluate_run, peak_rss_mb
@@ -38,13 +48,17 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
         description="Track the camera through an RGB-D sequence and build its Gaussian map. "
         "Ctrl-C ends the run after the current frame and saves everything so far.",
     )
-    parser.add_argument("config", nargs="?", type=Path, metavar="CONFIG", help="YAML file, or a packaged one by name")
-    parser.add_argument("--input", type=Path, metavar="PATH", help="folder or file of the recording")
-    parser.add_argument("--format", metavar="NAME", help="its layout (default: told from its files)")
+    add_input_options(parser)
     parser.add_argument("--output", type=Path, metavar="DIR", help="run folder (default: a new one under runs/)")
-    parser.add_argument("--frames", metavar="START:STOP:STEP", help="which frames, as a Python slice (100: or ::2)")
     parser.add_argument(
-        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override a setting; repeatable"
+        "--poses",
+        metavar="FILE",
+        help="camera-to-world poses that are known, as text or NumPy array; `recording`: those that came with it",
+    )
+    parser.add_argument(
+        "--poses-use",
+        choices=("fixed", "prior"),
+        help="fixed: build the map only; prior: tracking starts there (default: fixed, or as poses.use says)",
     )
     parser.add_argument(
         "--quality",
@@ -64,12 +78,15 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
 def execute(args: argparse.Namespace) -> int:
     """Do the run and evaluate it; 130 when it was stopped early."""
     started_s = time.perf_counter()
-    named = [] if args.format is None else [f"dataset.format={args.format}"]
     budget = [] if args.quality is None else [f"mapping.budget={_BUDGETS[args.quality]:g}"]
-    config = resolve_config(args.config, args.input, [*args.set, *named, *budget])
+    config = resolve_config(args.config, args.input, [*settings_of(args), *budget])
+    config = _with_poses(config, args.poses, args.poses_use)
     frames = parse_frames(args.frames)
     device = engine.start_device(args.device, args.threads)
     source = open_frames(config, args.input, frames)
+    poses = known_poses(config, source)
+    if config.dataset.format != "synthetic":  # whose depth lies where colour does
+        warn_of_misalignment(source)
     path = args.output or fresh_folder(Path("runs"), source.name, datetime.now())
     folder = RunFolder.create(path, args.overwrite)
     record = RunRecord(
@@ -84,7 +101,7 @@ def execute(args: argparse.Namespace) -> int:
     folder.write_config(config)
     try:
         with StopRequest() as stop:
-            metrics = _run_and_evaluate(args, config, source, folder, stop)
+            metrics = _run_and_evaluate(args, config, source, poses, folder, stop)
     except BaseException as error:
         _mark_failed(folder, record, error)
         raise
@@ -100,7 +117,12 @@ def execute(args: argparse.Namespace) -> int:
 
 
 def _run_and_evaluate(
-    args: argparse.Namespace, config: Config, source: RgbdSource, folder: RunFolder, stop: StopRequest
+    args: argparse.Namespace,
+    config: Config,
+    source: RgbdSource,
+    poses: pipeline.Poses | None,
+    folder: RunFolder,
+    stop: StopRequest,
 ) -> dict[str, Any]:
     """The metrics of the run, from the files that it wrote; images are left out once the user asked to stop."""
     system = engine.make_system(source.camera, config)
@@ -109,7 +131,8 @@ def _run_and_evaluate(
             source,
             system,
             folder,
-            read_ahead=can_read_ahead(config),
+            poses=poses,
+            read_ahead=can_read_ahead(source),
             refine=not args.no_final,
             observer=observer,
             stop_requested=stop,
@@ -119,9 +142,9 @@ def _run_and_evaluate(
         folder,
         config.evaluation,
         source,
-        _groundtruth(source),
+        _groundtruth(config, source),
         None if stop() else lambda gaussians, planes: engine.make_show(source.camera, gaussians, planes, config),
-        read_ahead=can_read_ahead(config),
+        read_ahead=can_read_ahead(source),
         stop_requested=stop,
     )
     metrics["stage_s"] |= {
@@ -134,10 +157,18 @@ def _run_and_evaluate(
     return metrics
 
 
-def _groundtruth(source: RgbdSource) -> Trajectory | None:
+def _with_poses(config: Config, file: str | None, use: str | None) -> Config:
+    """The settings with what `--poses` and `--poses-use` say."""
+    poses = config.poses if file is None else dataclasses.replace(config.poses, file=file)
+    if use is not None or (file is not None and poses.use == "none"):
+        poses = dataclasses.replace(poses, use=use or "fixed")
+    return dataclasses.replace(config, poses=poses)
+
+
+def _groundtruth(config: Config, source: RgbdSource) -> Trajectory | None:
     """The ground truth, opened only now that tracking is over; the run stands without it."""
     try:
-        return source.groundtruth()
+        return groundtruth_to_compare(config, source)
     except TgslamError as error:
         _log.warning("the trajectory metrics are null: %s", error)
         return None

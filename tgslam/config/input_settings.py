@@ -24,6 +24,22 @@ class DatasetExpert:
 
 
 @dataclass(frozen=True)
+class DepthCameraConfig:
+    """The camera that depth was taken with, where depth images do not lie on colour images; none if all is empty."""
+
+    intrinsics: tuple[float, ...] = setting((), doc="Its fx, fy, cx, cy in px; pixel centres are whole numbers.")
+    lens: tuple[float, ...] = setting((), doc="Its distortion in OpenCV's order k1, k2, p1, p2, k3; none if empty.")
+    size: tuple[int, ...] = setting(
+        (), 1, 16384, doc="Width and height of the images that these values are for, px; if empty, of those stored."
+    )
+    T_colour_depth: tuple[float, ...] = setting(
+        (),
+        doc="Where it is for the colour camera: tx, ty, tz in m and qx, qy, qz, qw, or the 3x4 or 4x4 matrix by rows "
+        "that takes points from depth to colour; in the same place if empty.",
+    )
+
+
+@dataclass(frozen=True)
 class DatasetConfig:
     """Where frames come from. Camera values of 0 mean: take them from the dataset format (or its calibration file)."""
 
@@ -52,6 +68,7 @@ class DatasetConfig:
     )
     min_depth_m: float = setting(0.1, 0.0, 10.0, doc="Nearer measurements are dropped, m.")
     max_depth_m: float = setting(10.0, 0.1, 1000.0, doc="Farther measurements are dropped, m.")
+    depth_camera: DepthCameraConfig = field(default_factory=DepthCameraConfig)
     expert: DatasetExpert = field(default_factory=DatasetExpert)
 
 

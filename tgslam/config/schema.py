@@ -12,6 +12,7 @@ from tgslam.config.graph_settings import ClosureConfig, LoopConfig
 from tgslam.config.input_settings import DatasetConfig, EvaluationConfig, SyntheticConfig
 from tgslam.config.map_settings import LossConfig, MappingConfig, SeedingConfig
 from tgslam.config.plane_settings import PlanesConfig, StructureConfig
+from tgslam.config.pose_settings import PosesConfig
 from tgslam.config.setting import setting
 from tgslam.config.tracking_settings import KeyframeConfig, TrackingConfig
 
@@ -28,6 +29,7 @@ class SystemConfig:
         doc="Settings in metres are for rooms; in a world of another size they count in units of so many m. null: told "
         "from the first frame, 1 for rooms.",
     )
+    poses: PosesConfig = dataclasses.field(default_factory=PosesConfig)
     tracking: TrackingConfig = dataclasses.field(default_factory=TrackingConfig)
     keyframes: KeyframeConfig = dataclasses.field(default_factory=KeyframeConfig)
     seeding: SeedingConfig = dataclasses.field(default_factory=SeedingConfig)

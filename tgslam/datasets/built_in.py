@@ -27,6 +27,8 @@ def synthetic_camera(width: int, height: int) -> Camera:
 class SyntheticSource:
     """A scene of `tgslam.synthetic` played at 30 Hz. Any frame can be read at any time and is always the same."""
 
+    uses_kernels = True  # frames are drawn by them
+
     def __init__(self, config: SyntheticConfig, seed: int) -> None:
         """Raises ConfigError for an unknown scene. seed: of the sensor's noise; the scenes themselves never change."""
         spec = scene_spec(config.scene)

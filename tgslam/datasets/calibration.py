@@ -15,7 +15,9 @@ from tgslam.types import Matrix4
 
 _log = logging.getLogger(__name__)
 _MUCH_ZOOM = 0.01  # relative change of focal lengths
-_DISTORTION_LENGTHS = (4, 5, 8, 12, 14)  # OpenCV's models
+_MIDDLE = 0.1  # of an image: lenses are centred to within this, about
+_OFF_MIDDLE = 0.25
+DISTORTION_LENGTHS = (4, 5, 8, 12, 14)  # OpenCV's models
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,8 @@ def resolve(config: DatasetConfig, default: Calibration | None, hint: str) -> Ca
 def check_size(calibration: Calibration, width: int, height: int, name: str) -> None:
     """Raise ConfigError if the calibration was published for images of another size: it is never scaled silently.
 
-    A principal point outside the image, the usual sign of configured values for another size, is logged as a warning.
+    A principal point that is outside the image or far from its middle, the usual sign of configured values for another
+    size, is logged as a warning.
     """
     if calibration.size not in (None, (width, height)):
         raise ConfigError(
@@ -126,6 +129,20 @@ def check_size(calibration: Calibration, width: int, height: int, name: str) -> 
             width,
             height,
         )
+    else:
+        _warn_of_another_size(calibration, width, height, name)
+
+
+def _warn_of_another_size(calibration: Calibration, width: int, height: int, name: str) -> None:
+    """Say so where the principal point is in the middle of images that are a few times as large, or as small."""
+    across, down = (2.0 * calibration.cx + 1.0) / width, (2.0 * calibration.cy + 1.0) / height
+    factor = 0.5 * (across + down)
+    if abs(across - down) < _MIDDLE * factor and not 1.0 - _OFF_MIDDLE < factor < 1.0 + _OFF_MIDDLE:
+        _log.warning(
+            "%s: its camera is likely for images of %.0fx%.0f, but these are %dx%d; if so, divide dataset.fx, fy, cx "
+            "and cy by %.3g",
+            name, factor * width, factor * height, width, height, factor,
+        )  # fmt: skip
 
 
 def _check(calibration: Calibration) -> None:
@@ -134,8 +151,8 @@ def _check(calibration: Calibration) -> None:
         raise ConfigError("dataset.fx, fy, cx, cy and distortion must be finite numbers")
     if calibration.fx <= 0:
         raise ConfigError(f"dataset.fx is {calibration.fx:g}, but it must be positive (px)")
-    if calibration.distortion and len(calibration.distortion) not in _DISTORTION_LENGTHS:
+    if calibration.distortion and len(calibration.distortion) not in DISTORTION_LENGTHS:
         raise ConfigError(
             f"dataset.distortion has {len(calibration.distortion)} values; OpenCV's models have "
-            f"{', '.join(map(str, _DISTORTION_LENGTHS))} (k1, k2, p1, p2, k3, ...)"
+            f"{', '.join(map(str, DISTORTION_LENGTHS))} (k1, k2, p1, p2, k3, ...)"
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,12 @@ from tgslam.camera import Camera
 from tgslam.config.input_settings import DatasetConfig
 from tgslam.datasets import image_files as images
 from tgslam.datasets.calibration import check_size
+from tgslam.datasets.depth_camera import own_depth_camera, register_to
+from tgslam.datasets.depth_scale import other_scale
 from tgslam.datasets.resampling import DepthResampler, Resizer, in_view
 from tgslam.datasets.stored import StoredFrames, StoredRecording
 from tgslam.datasets.truth import SceneTruth
-from tgslam.errors import ConfigError, DatasetError, FrameError
+from tgslam.errors import DatasetError, FrameError
 from tgslam.pixels import colour_as_float
 from tgslam.types import Frame, Trajectory
 
@@ -29,10 +32,11 @@ class FolderSource:
     def __init__(self, recording: StoredRecording, config: DatasetConfig) -> None:
         """Reads colour images until one tells the image size, and depth until one can be read.
 
-        Raises DatasetError if there is none of either, and ConfigError if the calibration is for another size.
+        Raises DatasetError if there is none of either, or if depth has another shape than colour and nothing says where
+        its camera is; and ConfigError if a calibration is for images of another size.
         """
         width, height = _image_size(recording.name, recording.frames)
-        _require_depth(recording.name, recording.frames)
+        depth_size = _depth_size(recording.name, recording.frames, (width, height))
         calibration = recording.calibration
         check_size(calibration, width, height, recording.name)
         self._recording, self._config = recording, config
@@ -46,7 +50,14 @@ class FolderSource:
         )
         self._told_size = False  # that depth is of another one
         self._resizer = None if config.width in (0, width) else Resizer(self._stored, config.width, recording.name)
-        self._resampler = _resampler(recording, self.camera)
+        own = own_depth_camera(config, recording, depth_size)
+        straight = own is not None and own.is_concentric and not own.calibration.distortion
+        self._resampler = DepthResampler(own.calibration, self.camera) if own and straight else None
+        self._registration = (
+            register_to(self.camera, own, own.calibration.size or depth_size) if own and not straight else None
+        )
+        if own is None:
+            _require_same_shape(recording.name, (height, width), depth_size)
 
     @property
     def name(self) -> str:
@@ -58,11 +69,22 @@ class FolderSource:
         """The camera after undistortion, flip and resizing."""
         return self._stored if self._resizer is None else self._resizer.camera
 
+    @property
+    def uses_kernels(self) -> bool:
+        """Whether depth is registered to colour as frames are read."""
+        return self._registration is not None
+
+    @property
+    def depth_units(self) -> float:
+        """By how many units in a metre whole-number depth is read."""
+        return self._config.depth_scale or self._recording.depth_units
+
     def __len__(self) -> int:
         return len(self._times_s)
 
     def read(self, index: int) -> Frame:
-        """Decode frame `index`, undistort it, flip its rows where the format asks for it, and resize it.
+        """Decode frame `index`, undistort it, flip its rows where the format asks for it, resize it, and bring depth to
+        colour.
 
         Raises FrameError for images that are missing, damaged, of the wrong kind or size, or without any depth in
         the configured range, and IndexError outside 0 <= index < len(self).
@@ -72,8 +94,10 @@ class FolderSource:
         frames = self._recording.frames
         rgb, raw = frames.colour(index), frames.depth(index)
         self._check_sizes(index, rgb.shape[:2], raw.shape)
-        rgb, raw = self._colour(rgb), self._depth(raw)
-        return Frame(index, self._times_s[index], colour_as_float(rgb), self._depth_m(index, raw))
+        depth_m = self._depth_m(index, raw if self._registration is not None else self._depth(raw))
+        if self._registration is not None:
+            depth_m = self._registration(depth_m)
+        return Frame(index, self._times_s[index], colour_as_float(self._colour(rgb)), depth_m)
 
     def groundtruth(self) -> Trajectory | None:
         """Camera-to-world poses of the recording, or None without them. Raises DatasetError."""
@@ -103,11 +127,11 @@ class FolderSource:
         return in_view(raw[::-1] if self._flips_rows else raw, self.camera.shape)
 
     def _depth_m(self, index: int, raw: NDArray[Any]) -> NDArray[np.float32]:
-        config = self._config
-        units = config.depth_scale or self._recording.depth_units
+        config, units = self._config, self.depth_units
         depth_m = images.depth_in_metres(raw, units, config.min_depth_m, config.max_depth_m)
         if not depth_m.any():
-            way_out = "check dataset.depth_scale" if raw.dtype.kind in "ui" else "float depth has to be in metres"
+            whole = f"check dataset.depth_scale{other_scale(raw, units)}"
+            way_out = whole if raw.dtype.kind in "ui" else "float depth has to be in metres"
             raise FrameError(
                 f"{self._recording.frames.names(index)[1]}: no pixel has a depth from {config.min_depth_m:g} to "
                 f"{config.max_depth_m:g} m; if all frames say so, {way_out}"
@@ -116,13 +140,14 @@ class FolderSource:
 
     def _check_sizes(self, index: int, colour: tuple[int, ...], depth: tuple[int, ...]) -> None:
         colour_name, depth_name = self._recording.frames.names(index)
-        if self._resampler is None and not _same_shape(colour, depth):
+        brought = self._resampler or self._registration
+        if brought is None and not _same_shape(colour, depth):
             raise FrameError(
                 f"{depth_name}: depth is {depth[1]}x{depth[0]}, but its colour image is {colour[1]}x{colour[0]}; "
                 "register depth to colour first"
             )
-        if self._resampler is not None and depth != self._resampler.stored_shape:
-            height, width = self._resampler.stored_shape
+        if brought is not None and depth != brought.stored_shape:
+            height, width = brought.stored_shape
             raise FrameError(f"{depth_name}: {depth[1]}x{depth[0]}, but the depth camera's images are {width}x{height}")
         expected = self._stored.shape
         if colour != expected:
@@ -134,36 +159,32 @@ def _same_shape(colour: tuple[int, ...], depth: tuple[int, ...]) -> bool:
     return abs(colour[0] * depth[1] - depth[0] * colour[1]) <= min(colour[1], depth[1])
 
 
-def _resampler(recording: StoredRecording, camera: Camera) -> DepthResampler | None:
-    """None where depth shows what colour shows."""
-    depth_camera = recording.depth_camera
-    if depth_camera is None:
-        return None
-    own = depth_camera.calibration
-    if not (np.isfinite(own.matrix).all() and own.fx > 0 and own.fy > 0):
-        raise ConfigError(
-            f"{recording.name}: no depth camera has fx, fy, cx, cy of {own.fx:g}, {own.fy:g}, {own.cx:g}, {own.cy:g} px"
+def _require_same_shape(name: str, colour: tuple[int, int], depth_size: tuple[int, int]) -> None:
+    """colour: height and width; depth_size: width and height. Raises DatasetError."""
+    if not _same_shape(colour, depth_size[::-1]):
+        raise DatasetError(
+            f"{name}: depth images are {depth_size[0]}x{depth_size[1]}, colour images {colour[1]}x{colour[0]}: their "
+            "shapes differ, so depth has a camera of its own; set dataset.depth_camera, or register depth to colour "
+            "first"
         )
-    if not depth_camera.is_concentric:
-        _log.warning(
-            "%s: its depth camera stands beside the colour camera, which is not made up for; set dataset.depth_camera",
-            recording.name,
-        )
-    return DepthResampler(own, camera)
 
 
-def _require_depth(name: str, frames: StoredFrames) -> None:
-    """Raise DatasetError if none of a few depth images, from all over the recording, can be read."""
-    count = len(frames.times_s)
-    first_error = ""
+def _depth_size(name: str, frames: StoredFrames, colour: tuple[int, int]) -> tuple[int, int]:
+    """Width and height of most depth images, by a few from all over the recording; those of colour if any has these.
+
+    Raises DatasetError if none of them can be read.
+    """
+    count, first_error = len(frames.times_s), ""
+    sizes: Counter[tuple[int, int]] = Counter()
     for index in range(0, count, max(1, count // _SAMPLE_IMAGES)):
         try:
-            frames.depth(index)
+            height, width = frames.depth(index).shape
+            sizes[width, height] += 1
         except FrameError as error:
             first_error = first_error or str(error)
-        else:
-            return
-    raise DatasetError(f"{name}: its depth images cannot be read; the first: {first_error}")
+    if not sizes:
+        raise DatasetError(f"{name}: its depth images cannot be read; the first: {first_error}")
+    return colour if colour in sizes else sizes.most_common(1)[0][0]
 
 
 def _image_size(name: str, frames: StoredFrames) -> tuple[int, int]:

@@ -40,6 +40,13 @@ class RgbdSource(Protocol):
         """The true planes and surfaces of the scene, or None where nobody knows them."""
 
 
+def uses_kernels(source: RgbdSource) -> bool:
+    """Whether reading a frame runs kernels, which only the thread that runs all others may do. Sources that do say so
+    by an attribute of that name.
+    """
+    return bool(getattr(source, "uses_kernels", False))
+
+
 class FrameRange:
     """Every `step`-th frame from `start` up to `stop` of a source: itself a source.
 
@@ -72,6 +79,17 @@ class FrameRange:
     def camera(self) -> Camera:
         """The camera of the source it was made from."""
         return self._source.camera
+
+    @property
+    def uses_kernels(self) -> bool:
+        """Whether the source that it was made from runs kernels as it reads."""
+        return uses_kernels(self._source)
+
+    @property
+    def depth_units(self) -> float | None:
+        """See `FolderSource.depth_units`; None where there are none."""
+        units: float | None = getattr(self._source, "depth_units", None)
+        return units
 
     def __len__(self) -> int:
         return len(self._indices)

@@ -7,25 +7,17 @@ import logging
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tgslam.files.clock import ticks_per_second, unit_name
+
 _log = logging.getLogger(__name__)
-# Units of clocks, s; the times since 1970 that pass a value are in them, and so are gaps between frames that pass one
-_CLOCKS = (
-    ("nanoseconds", 1e-9, 1e17, 5e5),
-    ("microseconds", 1e-6, 1e14, 500.0),
-    ("milliseconds", 1e-3, 1e11, np.inf),
-)
 
 
 def seconds_in(times: ArrayLike, name: str) -> float:
-    """Seconds in the unit of the times [N] of frames or poses. One that is no second is logged."""
-    values = np.unique(np.asarray(times, np.float64))
-    median = float(np.median(values)) if values.size else 0.0
-    gap = float(np.median(np.diff(values))) if values.size > 1 else 0.0
-    for unit, seconds, least, least_gap in _CLOCKS:
-        if median > least or gap > least_gap:
-            _log.warning("%s: its times are in %s, and are read so", name, unit)
-            return seconds
-    return 1.0
+    """Seconds in the unit of the times [N] of frames. One that is no second is logged."""
+    ticks = ticks_per_second(times)
+    if ticks != 1.0:
+        _log.warning("%s: its times are in %s, and are read so", name, unit_name(ticks))
+    return 1.0 / ticks
 
 
 def associate_times(

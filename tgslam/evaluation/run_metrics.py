@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -24,12 +25,15 @@ from tgslam.evaluation.plane_metrics import (
 from tgslam.evaluation.protocol import IMAGE_KEYS, TRAJECTORY_KEYS, Metrics, held_out_poses, trajectory_metrics
 from tgslam.evaluation.surface_switches import SURFACE_KEY
 from tgslam.evaluation.trajectory import align_poses
+from tgslam.evaluation.truth_conventions import likely_mistake
 from tgslam.output.log import read_log
 from tgslam.output.planes_io import read_planes
 from tgslam.output.ply import read_map
 from tgslam.output.run_folder import RunFolder
 from tgslam.output.trajectory_io import read_trajectory
 from tgslam.types import FrameReport, FrameStatus, Gaussians, Matrix4, Plane, Trajectory
+
+_log = logging.getLogger(__name__)
 
 METRIC_KEYS = (
     *("state", "frames", "frames_skipped", "frames_lost", "tracked_fraction"),
@@ -97,6 +101,9 @@ def evaluate_run(
     }
     if groundtruth is not None:
         metrics |= trajectory_metrics(run.every_frame, run.keyframes, groundtruth, config)
+        mistake = likely_mistake(run.every_frame, groundtruth, config.truth_tolerance_s)
+        if mistake is not None:
+            _log.warning("the ground truth fits the run badly, and would fit well otherwise: %s", mistake)
     if source is not None and make_show is not None:
         poses = _poses(folder, run, source, config.holdout_interval)
         truth = source.truth()

@@ -79,22 +79,33 @@ class _BarObserver:
         self._bar.update(self._task, advance=1, counts=str(self._counts))
 
 
-class _LineObserver:
-    """A line after every tenth of the frames or ten seconds, whichever comes later; and one at the end."""
+class _Pace:
+    """A line after every tenth of the work or ten seconds, whichever comes later; and one at the end."""
 
     def __init__(self, total: int) -> None:
-        self._counts = _Counts(total)
-        self._next_frames = _LINE_FRACTION * total
+        self._total = total
+        self._take_note(0)
+
+    def due(self, done: int) -> bool:
+        """Whether so much done is worth a line now."""
+        late = done >= self._next and time.monotonic() >= self._next_s
+        if late:
+            self._take_note(done)
+        return late or done == self._total
+
+    def _take_note(self, done: int) -> None:
+        self._next = done + _LINE_FRACTION * self._total
         self._next_s = time.monotonic() + _LINE_INTERVAL_S
 
+
+class _LineObserver:
+    def __init__(self, total: int) -> None:
+        self._counts, self._pace = _Counts(total), _Pace(total)
+
     def __call__(self, report: FrameReport) -> None:
-        counts = self._counts
-        counts.add(report)
-        due = counts.frames >= self._next_frames and time.monotonic() >= self._next_s
-        if due or counts.frames == counts.total:
-            _log.info("frame %d of %d: %s", counts.frames, counts.total, counts)
-            self._next_frames = counts.frames + _LINE_FRACTION * counts.total
-            self._next_s = time.monotonic() + _LINE_INTERVAL_S
+        self._counts.add(report)
+        if self._pace.due(self._counts.frames):
+            _log.info("frame %d of %d: %s", self._counts.frames, self._counts.total, self._counts)
 
 
 @contextmanager
@@ -110,3 +121,24 @@ def step_progress(what: str, total: int, console: Console, quiet: bool) -> Itera
     else:
         steps = itertools.count(1)
         yield lambda name: _log.info("%s %d of %d: %s", what, next(steps), total, name)
+
+
+@contextmanager
+def count_progress(what: str, total: int, console: Console, quiet: bool) -> Iterator[Callable[[], None]]:
+    """A function to call after each of `total` things of a kind, for as long as the block lasts."""
+    if quiet:
+        yield lambda: None
+    elif console.is_terminal:
+        columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=console) as bar:
+            task = bar.add_task("", total=total)
+            yield lambda: bar.update(task, advance=1)
+    else:
+        pace, counts = _Pace(total), itertools.count(1)
+
+        def count() -> None:
+            done = next(counts)
+            if pace.due(done):
+                _log.info("%s: %d of %d", what, done, total)
+
+        yield count

@@ -50,6 +50,8 @@ class FirstOrderTracker:
         T_cw: NDArray[np.float64],
         exposure: Exposure,
         prior: NDArray[np.float64] | None = None,
+        *,
+        firm: bool = False,
     ) -> TrackingResult:
         """See `Tracker.track`. The prior plays no part: steps are small enough to stay near the prediction."""
         if self._gradient.mean.shape[0] != gaussians.capacity:
@@ -65,10 +67,16 @@ class FirstOrderTracker:
             return self._judge.assess(frame, gaussians, T_cw, exposure)
 
     def assess(
-        self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure
+        self,
+        frame: Frame,
+        gaussians: GaussianMap,
+        T_cw: NDArray[np.float64],
+        exposure: Exposure,
+        *,
+        fits_exposure: bool = False,
     ) -> TrackingResult:
         """See `Tracker.assess`."""
-        return self._judge.assess(frame, gaussians, T_cw, exposure)
+        return self._judge.assess(frame, gaussians, T_cw, exposure, fits_exposure=fits_exposure)
 
     def accept(self, result: TrackingResult) -> None:
         """See `Tracker.accept`."""

@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 from tgslam.camera import Camera
 from tgslam.config.map_settings import LossConfig
+from tgslam.config.pose_settings import PosesConfig
 from tgslam.config.tracking_settings import TrackingConfig
 from tgslam.device import runtime
+from tgslam.geometry import inverse
 from tgslam.map.keyframes import Keyframe
 from tgslam.map.world import Map
 from tgslam.ops import image as images
@@ -31,24 +33,34 @@ _FALLBACKS = 3  # latest keyframes from which a lost camera is sought
 class FrontEnd:
     """Finds each frame's pose against the map."""
 
-    def __init__(self, camera: Camera, config: TrackingConfig, loss: LossConfig) -> None:
+    def __init__(self, camera: Camera, config: TrackingConfig, loss: LossConfig, poses: PosesConfig) -> None:
         self.tracker = make_tracker(camera, config, loss)
-        self._camera, self._config = camera, config
+        self._camera, self._config, self._poses = camera, config, poses
         self._motion = MotionFilter(config.expert.motion)
         self._doubt = Doubt(camera, coarsest(camera, config))
         self._exposure, self._exposures = Exposure(), KeyframeExposures(camera)
         self._look: Look | None = None  # of the last frame, where it has been looked at
         self._previous: Look | tuple[FloatImage, FloatImage] | None = None  # the last frame, unless that is lost
 
-    def track(self, frame: Frame, world: Map, latest_T_cw: Matrix4) -> TrackingResult:
+    def begin(self, T_wc: Matrix4 | None) -> TrackingResult:
+        """Of the first frame, which is the world's frame unless its pose [4, 4] is known."""
+        return TrackingResult(np.eye(4) if T_wc is None else inverse(T_wc), Exposure(), np.eye(6), lost=False)
+
+    def track(self, frame: Frame, world: Map, latest_T_cw: Matrix4, T_wc: Matrix4 | None = None) -> TrackingResult:
         """The frame's pose, from where motion leads. Where that is in doubt, places count too where it is recognised;
         if it is lost, also those of the last frame, T_cw [4, 4], and of the latest keyframes.
+
+        T_wc: [4, 4] as it is known beforehand: what the settings say of such poses goes before motion.
         """
+        if T_wc is not None and self._poses.use == "fixed":
+            return self._hold(frame, world, inverse(T_wc))
         predicted, prior = self._motion.predict(frame.timestamp_s), self._motion.information(frame.timestamp_s)
-        first = self.tracker.track(frame, world.gaussians, predicted, self._exposure, prior)
+        if T_wc is not None:
+            predicted, prior = inverse(T_wc), self._poses.information
+        first = self.tracker.track(frame, world.gaussians, predicted, self._exposure, prior, firm=T_wc is not None)
         self._look, median_m = None, images.median_of_measured(runtime.to_device(frame.depth_m))
         found = first
-        if self._doubt.about(first, predicted, median_m):
+        if first.lost or (T_wc is None and self._doubt.about(first, predicted, median_m)):
             found = self._elsewhere(frame, world, first, latest_T_cw)
         self._previous = None if found.lost else self._look or _copied(frame)
         if found.lost:
@@ -59,6 +71,12 @@ class FrontEnd:
         self._doubt.settle(found, predicted, median_m)
         self.tracker.accept(found)
         return found
+
+    def _hold(self, frame: Frame, world: Map, T_cw: Matrix4) -> TrackingResult:
+        """The frame is at T_cw [4, 4], whatever its pixels say."""
+        self._look = None
+        found = self.tracker.assess(frame, world.gaussians, T_cw, self._exposure, fits_exposure=True)
+        return replace(found, lost=False, message="")
 
     def _elsewhere(self, frame: Frame, world: Map, first: TrackingResult, latest_T_cw: Matrix4) -> TrackingResult:
         """Where the frame is recognised, or as aligned first if that is the same or it is recognised nowhere."""

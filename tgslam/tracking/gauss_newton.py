@@ -33,6 +33,7 @@ from tgslam.types import Exposure, Frame
 
 _CONVERGED = 1e-5  # rad and m: a smaller step ends a level
 _DAMPING = 1e-6  # of the normal matrix's trace
+_EXPOSURE_FITS = 3  # at a pose that is known: each weighs pixels anew
 _BACKED = 0.5  # of the frame's pixels with depth match a reference: it shows what the map does
 
 
@@ -87,6 +88,8 @@ class GaussNewtonTracker:
         T_cw: NDArray[np.float64],
         exposure: Exposure,
         prior: NDArray[np.float64] | None = None,
+        *,
+        firm: bool = False,
     ) -> TrackingResult:
         """See `Tracker.track`."""
         predicted, correlated_px = T_cw, self.config.expert.residuals.correlated_px
@@ -96,7 +99,9 @@ class GaussNewtonTracker:
         for _ in range(self.config.expert.model.renders):
             model = self._model(gaussians, T_cw)
             with stage(self.stopwatch, "align"):
-                T_ml, exposure, last = self._align(live, model, T_cw, exposure, predicted @ inverse(T_cw), prior)
+                T_ml, exposure, last = self._align(
+                    live, model, T_cw, exposure, predicted @ inverse(T_cw), prior, firm=firm
+                )
             T_cw = inverse(T_ml) @ T_cw
         return self._result(T_cw, T_ml, exposure, last)
 
@@ -105,11 +110,20 @@ class GaussNewtonTracker:
         self.detector.accept(result.measures)
 
     def assess(
-        self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure
+        self,
+        frame: Frame,
+        gaussians: GaussianMap,
+        T_cw: NDArray[np.float64],
+        exposure: Exposure,
+        *,
+        fits_exposure: bool = False,
     ) -> TrackingResult:
         """See `Tracker.assess`."""
-        live = self._live_pyramid.update(frame)
-        equations = self._linearise[0](live[0], self._model(gaussians, T_cw)[0], np.eye(4), exposure)
+        live, model = self._live_pyramid.update(frame)[0], self._model(gaussians, T_cw)[0]
+        equations = self._linearise[0](live, model, np.eye(4), exposure)
+        for _ in range(_EXPOSURE_FITS if fits_exposure else 0):
+            exposure = fit_exposure(equations.intensity, self.config.exposure, exposure)
+            equations = self._linearise[0](live, model, np.eye(4), exposure)
         return self._result(T_cw, np.eye(4), exposure, equations)
 
     def _result(
@@ -149,13 +163,15 @@ class GaussNewtonTracker:
         exposure: Exposure,
         T_pm: NDArray[np.float64],
         prior: NDArray[np.float64],
+        *,
+        firm: bool,
     ) -> tuple[NDArray[np.float64], Exposure, NormalEquations]:
         """Coarse to fine from the identity; returns T_ml, the exposure, and the last equations.
 
         T_mw: world to where the model was rendered.
         T_pm: from where the model was rendered to the predicted camera, which `prior` [6, 6] draws the pose to, at the
         finest level. Coarser ones have fewer pixels to hold against it, so it counts as much less there. At either, it
-        only speaks where the pixels do not.
+        only speaks where the pixels do not, unless it is firm: then both count as they are, at every level.
         """
         T_ml = np.eye(4)
         matches = [_Match.of(levels, reference, T_mw, exposure) for levels, reference in self._references]
@@ -169,7 +185,7 @@ class GaussNewtonTracker:
                     equations = equations.joined(other, T_rm)
                 # a weak damping holds the directions that nothing observes
                 damping = _DAMPING * np.trace(equations.A) + 1e-9
-                drawn = unopposed(prior / 4**level, equations.A)
+                drawn = prior if firm else unopposed(prior / 4**level, equations.A)
                 gradient = equations.b + drawn @ se3_log(T_pm @ T_ml)
                 step = np.linalg.solve(equations.A + drawn + damping * np.eye(6), -gradient)
                 T_ml = se3_exp(step) @ T_ml

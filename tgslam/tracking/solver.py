@@ -43,17 +43,28 @@ class Tracker(Protocol):
         T_cw: NDArray[np.float64],
         exposure: Exposure,
         prior: NDArray[np.float64] | None = None,
+        *,
+        firm: bool = False,
     ) -> TrackingResult:
         """Pose of `frame` from the prediction T_cw [4, 4] (world to camera) and the last frame's exposure.
 
         prior: [6, 6] information on a left perturbation of T_cw, how far it is to be trusted; None = a place to start.
+        firm: it was measured, and counts beside the pixels; else it only speaks where they do not.
         """
         ...
 
     def assess(
-        self, frame: Frame, gaussians: GaussianMap, T_cw: NDArray[np.float64], exposure: Exposure
+        self,
+        frame: Frame,
+        gaussians: GaussianMap,
+        T_cw: NDArray[np.float64],
+        exposure: Exposure,
+        *,
+        fits_exposure: bool = False,
     ) -> TrackingResult:
-        """What the frame says of a pose that was found otherwise; the pose stays as it is."""
+        """What the frame says of a pose that was found otherwise; the pose stays as it is, and so does the exposure
+        unless it is to be fitted.
+        """
         ...
 
     def accept(self, result: TrackingResult) -> None:

@@ -140,6 +140,4 @@ QUALITY = Study(
     columns=(*_TRAJECTORY, *_IMAGES, _FPS),
     scenes=("room", "corridor"),
 )
-STUDIES = {
-    study.name: study for study in (INTERVAL, STRUCTURE, GATE, TERMS, VIEWPOINTS, RECORDINGS, QUALITY)
-}
+STUDIES = {study.name: study for study in (INTERVAL, STRUCTURE, GATE, TERMS, VIEWPOINTS, RECORDINGS, QUALITY)}

@@ -1,0 +1,1 @@
+"""Recordings written in the layouts of other programs and benchmarks."""
