@@ -92,7 +92,7 @@ class Growth:
             depth_m = np.where((planes.depth_m > 0) & (images.depth_m <= 0), planes.depth_m, depth_m)
             normals_c = np.where(planes.depth_m[..., None] > 0, planes.normals_c, normals_c)
         ids = planes.ids if planes else None
-        colour = exposure.gain * images.colour + np.float32(exposure.bias)
+        colour = exposure.gain * exposure.balanced(images.colour) + np.float32(exposure.bias)
         return _Completed(Quadtree(colour, depth_m, self._seeding, self._noise, ids), sound, normals_c, ids)
 
     def _disproved(self, world: Map, surface: Surface) -> NDArray[np.bool_]:

@@ -46,6 +46,8 @@ class FrontEnd:
         """
         predicted, prior = self._motion.predict(frame.timestamp_s), self._motion.information(frame.timestamp_s)
         first = self.tracker.track(frame, world.gaussians, predicted, self._exposure, prior)
+        if self._doubt.lost and not self._doubt.convincing(first):
+            first = _not_there(first)
         self._look, median_m = None, images.median_of_measured(runtime.to_device(frame.depth_m))
         found = first
         if self._doubt.about(first, predicted, median_m):
@@ -75,7 +77,7 @@ class FrontEnd:
             return first
         others = [latest_T_cw, *(keyframe.T_cw for keyframe in world.keyframes[: -_FALLBACKS - 1 : -1])]
         results = (self.tracker.track(frame, world.gaussians, T_cw, self._exposure) for T_cw in others)
-        return next((result for result in results if not result.lost), first)
+        return next((result for result in results if self._doubt.convincing(result)), first)
 
     def _at(self, frame: Frame, world: Map, place: Place) -> TrackingResult:
         """Aligned from a place to start. Where that leads away, the map does not show yet what is there: it stays."""
@@ -131,6 +133,14 @@ class FrontEnd:
     def _reference(self, world: Map, number: int) -> Reference:
         keyframe, planes_c = world.keyframes[number], steadying_planes(world, number)
         return Reference(keyframe.colour(), keyframe.depth_m(), keyframe.T_cw, keyframe.exposure, planes_c)
+
+
+def _not_there(result: TrackingResult) -> TrackingResult:
+    """Lost, though what was aligned would do where the camera is known to be near."""
+    if result.lost:
+        return result
+    overlap, agreement = result.measures["overlap"], result.measures["agreement"]
+    return replace(result, lost=True, message=f"only {overlap * agreement:.0%} of the frame agrees with the map")
 
 
 def _median(depth_m: FloatImage) -> float:
