@@ -119,6 +119,7 @@ class FrameStatus(Enum):
 
     INITIAL = "initial"  # the first one: it defines the world frame
     TRACKED = "tracked"
+    APART = "apart"  # tracked in a piece of the map that was not tied to the first one yet
     LOST = "lost"  # pose coasted on the motion model
     SKIPPED = "skipped"  # unusable image; it has no pose
 

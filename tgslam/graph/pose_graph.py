@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -118,6 +118,16 @@ class PoseGraph:
         for keyframe, seen in sightings.items():
             for plane_id, plane in seen.items():
                 self.add_plane_observation(keyframe, plane_id, plane)
+        self._rebuild()
+
+    def carry(self, keyframes: Iterable[int], motion: Vector) -> None:
+        """Keyframes and the planes that they saw are elsewhere, p_w <- motion p_w [4, 4]: `optimise` starts there."""
+        carried, pose = set(keyframes), gtsam.Pose3(motion)
+        for keyframe in carried:
+            self._values.update(pose_key(keyframe), pose.compose(self._pose_of(keyframe)))
+        for plane_id, sighting in {s.plane_id: s for s in self._sightings if s.keyframe in carried}.items():
+            world = sighting.plane.transformed(self._pose_of(sighting.keyframe).matrix())
+            self._values.update(plane_key(plane_id), gtsam.OrientedPlane3(np.append(world.normal, world.offset_m)))
         self._rebuild()
 
     def optimise(self) -> GraphEstimate:

@@ -12,12 +12,14 @@ from tgslam.config.map_settings import LossConfig
 from tgslam.config.tracking_settings import TrackingConfig
 from tgslam.device import runtime
 from tgslam.map.keyframes import Keyframe
+from tgslam.map.pieces import nearest
 from tgslam.map.world import Map
 from tgslam.ops import image as images
 from tgslam.recognition.verification import Look
 from tgslam.tracking.brightness import KeyframeExposures
 from tgslam.tracking.doubt import Doubt
 from tgslam.tracking.hypotheses import Place, Sighted, recognised
+from tgslam.tracking.lost import Patience
 from tgslam.tracking.motion import MotionFilter
 from tgslam.tracking.references import Reference, references_of
 from tgslam.tracking.result import TrackingResult
@@ -35,14 +37,15 @@ class FrontEnd:
         self.tracker = make_tracker(camera, config, loss)
         self._camera, self._config = camera, config
         self._motion = MotionFilter(config.expert.motion)
-        self._doubt = Doubt(camera, coarsest(camera, config))
+        self._doubt, self._patience = Doubt(camera, coarsest(camera, config)), Patience()
         self._exposure, self._exposures = Exposure(), KeyframeExposures(camera)
         self._look: Look | None = None  # of the last frame, where it has been looked at
         self._previous: Look | tuple[FloatImage, FloatImage] | None = None  # the last frame, unless that is lost
 
     def track(self, frame: Frame, world: Map, latest_T_cw: Matrix4) -> TrackingResult:
         """The frame's pose, from where motion leads. Where that is in doubt, places count too where it is recognised;
-        if it is lost, also those of the last frame, T_cw [4, 4], and of the latest keyframes.
+        if it is lost, also those of the last frame, T_cw [4, 4], and of the latest keyframes. Where nothing is
+        known for long, a new piece of the map begins.
         """
         predicted, prior = self._motion.predict(frame.timestamp_s), self._motion.information(frame.timestamp_s)
         first = self.tracker.track(frame, world.gaussians, predicted, self._exposure, prior)
@@ -55,7 +58,8 @@ class FrontEnd:
         self._previous = None if found.lost else self._look or _copied(frame)
         if found.lost:
             self._doubt.forget()
-            return replace(first, T_cw=predicted, exposure=self._exposure)
+            return self._not_found(replace(first, T_cw=predicted, exposure=self._exposure), world)
+        self._patience.reset()
         if found is not first:
             self.tracker.rasterizer.forward(world.gaussians, found.T_cw)
         self._doubt.settle(found, predicted, median_m)
@@ -87,6 +91,21 @@ class FrontEnd:
         stays = self.tracker.assess(frame, world.gaussians, place.T_cw, self._exposure)
         return replace(stays, information=place.information)
 
+    def _not_found(self, lost: TrackingResult, world: Map) -> TrackingResult:
+        """Lost, or the beginning of a new piece of the map."""
+        if self._look is None or not self._patience.ends(len(self._look.features)):
+            return lost
+        self._patience.reset()
+        self._previous = self._look
+        return TrackingResult(world.pieces.start(lost.T_cw), lost.exposure, np.zeros((6, 6)), lost=False, begins=True)
+
+    def elsewhere(self, result: TrackingResult, world: Map) -> str:
+        """Why the frame has to be a keyframe since it is in another piece of the map than the latest one; "" if not."""
+        if result.begins:
+            return "a new piece of the map begins"
+        near = nearest(result.T_cw, world.keyframes.T_cw())
+        return "" if world.pieces.of(near) == world.pieces.of(-1) else "back in another piece of the map"
+
     def tracked_view(self, world: Map) -> NDArray[np.bool_]:
         """[N] Gaussians in view of the last frame, as of the rendering that it was aligned to."""
         return self.tracker.rasterizer.visible(world.gaussians.count)
@@ -94,6 +113,10 @@ class FrontEnd:
     def keyframe(self, frame: Frame, result: TrackingResult, world: Map) -> Keyframe:
         """Add the tracked frame to the map's keyframes, as bright as the others show the same surfaces."""
         keyframe = Keyframe(frame, result.T_cw, result.exposure, result.information)
+        if result.begins or not world.keyframes:
+            world.pieces.begin()
+        else:
+            world.pieces.add(nearest(result.T_cw, world.keyframes.T_cw()))
         world.keyframes.add(keyframe)
         world.looks.add(self._look or world.looks.of(frame.colour, frame.depth_m))
         if self._config.exposure == "gain":
