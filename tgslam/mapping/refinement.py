@@ -139,7 +139,9 @@ class Refiner:
         cached = self._observations.pop(key, None)
         if cached is None:
             colour, depth_m = keyframe.exposure.balanced(keyframe.colour()), keyframe.depth_m()
-            cached = losses.observe(runtime.to_device(colour), runtime.to_device(depth_m), self.loss)
+            left_out = keyframe.left_out
+            mask = None if left_out is None else runtime.to_device((~left_out).astype(np.float32))
+            cached = losses.observe(runtime.to_device(colour), runtime.to_device(depth_m), self.loss, mask)
         self._observations[key] = cached
         while len(self._observations) > self.config.window + self.config.anchor_count:
             self._observations.popitem(last=False)

@@ -11,6 +11,7 @@ from tgslam.camera import Camera
 from tgslam.config.map_settings import LossConfig
 from tgslam.config.tracking_settings import TrackingConfig
 from tgslam.device import runtime
+from tgslam.map.free_space import intruding
 from tgslam.map.keyframes import Keyframe
 from tgslam.map.pieces import nearest
 from tgslam.map.world import Map
@@ -111,7 +112,10 @@ class FrontEnd:
         return self.tracker.rasterizer.visible(world.gaussians.count)
 
     def keyframe(self, frame: Frame, result: TrackingResult, world: Map) -> Keyframe:
-        """Add the tracked frame to the map's keyframes, as bright as the others show the same surfaces."""
+        """Add the tracked frame to the map's keyframes, as bright as the others show the same surfaces.
+
+        What has come in front of what they saw does not count.
+        """
         keyframe = Keyframe(frame, result.T_cw, result.exposure, result.information)
         if result.begins or not world.keyframes:
             world.pieces.begin()
@@ -119,6 +123,7 @@ class FrontEnd:
             world.pieces.add(nearest(result.T_cw, world.keyframes.T_cw()))
         world.keyframes.add(keyframe)
         world.looks.add(self._look or world.looks.of(frame.colour, frame.depth_m))
+        keyframe.leave_out(intruding(world, len(world.keyframes) - 1))
         if self._config.exposure == "gain":
             self._exposures.add(world.keyframes)
         return keyframe
