@@ -196,11 +196,14 @@ def _local_normal(shape: ti.i32, axis: ti.i32, p: ti.math.vec3, half: ti.math.ve
 
 @ti.func
 def _label(shape: ti.i32, axis: ti.i32, p: ti.math.vec3, first: ti.i32) -> ti.i32:
-    """Plane label: quads have one, boxes six (-x, +x, -y, +y, -z, +z), cylinders two caps (-z, +z)."""
+    """Plane label: quads have one, boxes six (-x, +x, -y, +y, -z, +z), cylinders two caps (-z, +z).
+
+    None where first < 0.
+    """
     label = -1
     if shape == QUAD:
         label = first
-    elif axis >= 0:
+    elif axis >= 0 and first >= 0:
         side = ti.select(p[axis] > 0.0, 1, 0)
         label = first + ti.select(shape == BOX, 2 * axis, 0) + side
     return label

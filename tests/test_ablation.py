@@ -218,7 +218,9 @@ def test_there_is_no_such_study(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["bench", "ablation", "gaet"])
     assert ended.value.code == 2
-    assert "identity, interval, structure, gate, terms, viewpoints, recordings, quality and all" in capsys.readouterr().err
+    assert (
+        "identity, interval, structure, gate, terms, viewpoints, recordings, quality and all" in capsys.readouterr().err
+    )
 
 
 # A cluster

@@ -25,7 +25,9 @@ def source() -> SyntheticSource:
     return SyntheticSource(SyntheticConfig(scene="room", frames=150, width=160, height=120), seed=0)
 
 
-def keyframe(source: SyntheticSource, number: int, brightness: float, turn: NDArray | None = None) -> Keyframe:
+def keyframe(
+    source: SyntheticSource, number: int, brightness: float | NDArray, turn: NDArray | None = None
+) -> Keyframe:
     """turn: [4, 4] of its camera, which its images know nothing of."""
     frame = source.read(number)
     frame = replace(frame, colour=np.clip(brightness * frame.colour, 0.0, 1.0).astype(np.float32))
@@ -154,3 +156,16 @@ def test_the_map_ties_a_keyframe_that_nothing_else_does() -> None:
     held = Course(np.zeros(1), np.zeros(1, bool))
     found = Courses([Tie(1, MAP, 0.4, 0.05)], np.array([0.1])).best(held, np.array([0.3]))
     assert_allclose(found.log_gains, 0.4)
+
+
+def test_white_balance_is_followed_and_nothing_else_is_taken_for_it(source: SyntheticSource) -> None:
+    """Two keyframes as they are, three with another balance; alone, steps of the gain leave the balance as it is."""
+    tint, white = np.array([0.7, 1.0, 1.35]), np.ones(3)
+    for factors in ([white, white, tint, tint, tint], [white, 0.7 * white, 0.7 * white, white, white]):
+        keyframes, exposures = Keyframes(source.camera, SensorNoise(0.0015)), KeyframeExposures(source.camera)
+        for number, factor in zip(range(0, 40, 8), factors, strict=True):
+            keyframes.add(keyframe(source, number, factor))
+            exposures.add(keyframes)
+        found = np.array([each.exposure.gain * np.array(each.exposure.balance) for each in keyframes])
+        assert_allclose(found, 1.0 / np.array(factors), rtol=0.02)
+        assert np.allclose([each.exposure.balance for each in keyframes], 1.0) == (factors[2] is not tint)

@@ -44,7 +44,12 @@ def world_of(*numbers: int) -> Map:
 
 def result(x_m: float, off_sigmas: float = 1.0, *, lost: bool = False, agreement: float = 1.0) -> TrackingResult:
     """A camera at -x, with what meets the map off by so much."""
-    measures = {"depth_residual_sigmas": off_sigmas, "colour_residual_sigmas": 0.0, "agreement": agreement}
+    measures = {
+        "depth_residual_sigmas": off_sigmas,
+        "colour_residual_sigmas": 0.0,
+        "agreement": agreement,
+        "overlap": 1.0,
+    }
     return TrackingResult(at(x_m), Exposure(), np.eye(6), lost, "lost" if lost else "", measures)
 
 
@@ -229,3 +234,18 @@ def test_where_nothing_holds_the_camera_coasts_with_the_evidence_of_the_first_at
     found, fake = tracked([], predicted_m=1.0, latest_m=0.5, number=540)
     assert found.lost and found.message == "lost" and fake.accepted == 0
     assert x_of(found.T_cw) == pytest.approx(1.0)
+
+
+def test_after_lost_frames_alignment_alone_has_to_be_convincing() -> None:
+    """A piece of wall meets some piece of the map from almost anywhere."""
+    doubt = Doubt(CAMERA, CAMERA.halved(2))
+    for _ in range(5):
+        doubt.settle(result(0.0), at(0.0), 1.0)
+    good = result(0.0)
+    little = replace(good, measures={**good.measures, "overlap": 0.3})
+    assert doubt.convincing(good) and not doubt.convincing(little)
+    assert not doubt.convincing(result(0.0, agreement=0.4)) and not doubt.convincing(result(0.0, lost=True))
+    assert not doubt.convincing(result(0.0, 2.0))  # that far off is unusual
+    assert not doubt.lost
+    doubt.forget()
+    assert doubt.lost

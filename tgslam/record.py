@@ -26,9 +26,9 @@ class FrameRecord:
         yield
         self._stage_s[name] = self._stage_s.get(name, 0.0) + time.perf_counter() - start
 
-    def remark(self, text: str) -> None:
+    def remark(self, *texts: str) -> None:
         """Something for the log."""
-        self._remarks.append(text)
+        self._remarks += texts
 
     def report(
         self,

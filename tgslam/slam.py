@@ -58,12 +58,13 @@ class Slam:
         T_cw = self._poses.latest_T_cw()
         if status is not FrameStatus.INITIAL:  # of the first pose, nothing was measured
             self.front_end.follow(frame, result, T_cw)
+        status = FrameStatus.APART if status is FrameStatus.TRACKED and self.map.pieces.apart() else status
         closures = self._closing.closure_count if self._closing else None
         return record.report(status, cue, result, T_cw, self.map.gaussians.count, closures)
 
     def _keyframe_cue(self, frame: Frame, result: TrackingResult) -> str:
-        seen = self.front_end.tracked_view(self.map)
-        return self._cues.ask(frame, result.T_cw, seen, result.measures["overlap"])
+        cue, seen = self.front_end.elsewhere(result, self.map), self.front_end.tracked_view(self.map)
+        return cue or self._cues.ask(frame, result.T_cw, seen, result.measures["overlap"])
 
     def _map(self, frame: Frame, result: TrackingResult, record: FrameRecord) -> None:
         """The frame becomes a keyframe. The order matters: each step looks at what those before have left.
@@ -95,8 +96,7 @@ class Slam:
         except GraphError as error:  # a map that is not corrected is better than none
             record.remark(str(error))
             return
-        if correction.closures:
-            record.remark(f"closures with keyframes {', '.join(map(str, correction.closures))}")
+        record.remark(*correction.remarks)
         if correction.motions:
             with record.stage("follow"):
                 self.map.move(correction.motions)

@@ -30,10 +30,17 @@ class Frame:
 
 @dataclass(frozen=True)
 class Exposure:
-    """map intensity = gain * frame intensity + bias."""
+    """map intensity = gain * frame intensity + bias; of a channel, gain * balance of it."""
 
     gain: float = 1.0
     bias: float = 0.0
+    balance: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of red, green and blue: of a keyframe's image alone
+
+    def balanced(self, colour: FloatImage) -> FloatImage:
+        """The colours [..., 3] by the map's white balance."""
+        if self.balance == (1.0, 1.0, 1.0):
+            return colour
+        return colour * np.array(self.balance, np.float32)
 
     def relative_to(self, other: Exposure) -> Exposure:
         """That of the same frame against another frame's image, whose exposure is `other`."""
@@ -112,6 +119,7 @@ class FrameStatus(Enum):
 
     INITIAL = "initial"  # the first one: it defines the world frame
     TRACKED = "tracked"
+    APART = "apart"  # tracked in a piece of the map that was not tied to the first one yet
     LOST = "lost"  # pose coasted on the motion model
     SKIPPED = "skipped"  # unusable image; it has no pose
 

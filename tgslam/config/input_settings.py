@@ -86,6 +86,21 @@ class SyntheticConfig:
         0.0, 0.0, 1.0, doc="Amplitude of a slow change of the camera's gain, as a part of it; 0 = none."
     )
     motion_blur: int = setting(1, 1, 32, doc="Images that are averaged over an exposure; 1 = sharp.")
+    event: str = setting(
+        "none",
+        choices=(
+            "none",
+            "exposure_step",
+            "white_balance",
+            "cover",
+            "gap",
+            "kidnap_known",
+            "kidnap_unknown",
+            "moving_box",
+        ),
+        doc="What happens in the middle of it. cover: a hand before the lens for 1 s. gap: 1 s without frames. kidnap: "
+        "the camera is carried off, to near its first place or to one that it has not seen.",
+    )
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from tgslam.config.input_settings import SyntheticConfig
 from tgslam.datasets.truth import SceneTruth
 from tgslam.synthetic import primitives as surfaces
 from tgslam.synthetic import sensor
+from tgslam.synthetic.events import event
 from tgslam.synthetic.ray_casting import Raycaster, View
 from tgslam.synthetic.scenes import FRAME_RATE_HZ, scene_spec
 from tgslam.types import FloatImage, Frame, Matrix4, Trajectory
@@ -35,8 +36,11 @@ class SyntheticSource:
         self.name = f"synthetic-{config.scene}"
         self.camera = synthetic_camera(config.width, config.height)
         self._config, self._seed = config, seed
-        self._scene, self._path = spec.build(config.frames / FRAME_RATE_HZ)
-        self._raycaster = Raycaster(self._scene, self.camera)
+        duration_s = config.frames / FRAME_RATE_HZ
+        self._scene, path = spec.build(duration_s)
+        self._event = event(config.event, path, duration_s)
+        self._furnished = self._event.furnished(self._scene)
+        self._raycaster = Raycaster(self._furnished, self.camera)
         self._latest: tuple[int, View] | None = None  # a frame, and its geometry at the middle of the exposure
 
     def __len__(self) -> int:
@@ -45,7 +49,7 @@ class SyntheticSource:
     def read(self, index: int) -> Frame:
         """The frame as the configured sensor sees it. Raises IndexError outside 0 .. len - 1."""
         colour, view = self._exposed(index)
-        depth_m = view.depth_m
+        colour, depth_m = self._event.shown(colour, view.depth_m, index / FRAME_RATE_HZ)
         if self._config.noise:
             rng = np.random.default_rng((self._seed, index))
             colour = sensor.noisy_colour(colour, rng)
@@ -53,8 +57,8 @@ class SyntheticSource:
         return Frame(index, self._time_s(index), colour, depth_m)
 
     def clean(self, index: int) -> Frame:
-        """The frame without noise, blur or change of exposure; depth is exact."""
-        colour, view = self._raycaster.render(self.pose(index))
+        """The frame without noise, blur, change of colours or a hand before the lens; depth is exact."""
+        colour, view = self._render(self._own_s(index))
         return Frame(index, self._time_s(index), colour, view.depth_m)
 
     def labels(self, index: int) -> NDArray[np.int32]:
@@ -87,34 +91,50 @@ class SyntheticSource:
 
     def pose(self, index: int) -> Matrix4:
         """T_wc [4, 4] at the middle of the frame's exposure. Raises IndexError outside 0 .. len - 1."""
-        return self._path(self._time_s(index))
+        return self._event.path(self._own_s(index))
 
     def groundtruth(self) -> Trajectory:
         """The exact trajectory of all frames."""
-        times_s = np.arange(len(self)) / FRAME_RATE_HZ
-        return Trajectory(times_s, np.stack([self._path(float(t)) for t in times_s]))
+        frames = range(len(self))
+        return Trajectory(np.array([self._time_s(k) for k in frames]), np.stack([self.pose(k) for k in frames]))
 
-    def _time_s(self, index: int) -> float:
+    def gain(self, index: int) -> NDArray[np.float64]:
+        """[3] what the frame's colours are, as multiples of the scene's."""
+        own_s = self._own_s(index)
+        return sensor.exposure_gain(own_s, self._config.exposure_change) * np.array(self._event.gain(own_s))
+
+    def _own_s(self, index: int) -> float:
+        """When the frame is taken, were there no gap."""
         if not 0 <= index < len(self):
             raise IndexError(f"{self.name}: frame {index} of {len(self)}")
         return index / FRAME_RATE_HZ
 
+    def _time_s(self, index: int) -> float:
+        """The frame's timestamp."""
+        own_s = self._own_s(index)
+        return own_s + self._event.late_s(own_s)
+
+    def _render(self, own_s: float) -> tuple[FloatImage, View]:
+        """Exact colour and geometry at that time."""
+        return self._raycaster.render(self._event.path(own_s), self._event.seen(self._furnished, own_s))
+
     def _view(self, index: int) -> View:
         """The exact geometry of a frame: asked for its labels and its areas, as of one just read, it is cast once."""
         if self._latest is None or self._latest[0] != index:
-            self._latest = index, self._raycaster.view(self.pose(index))
+            moved = self._event.seen(self._furnished, self._own_s(index))
+            self._latest = index, self._raycaster.view(self.pose(index), moved)
         return self._latest[1]
 
     def _exposed(self, index: int) -> tuple[FloatImage, View]:
-        """Colour with blur and gain, and the exact geometry at the exposure's middle."""
-        time_s, images = self._time_s(index), self._config.motion_blur
-        colour, view = self._raycaster.render(self._path(time_s))
+        """Colour with blur and slow gain, and the exact geometry at the exposure's middle."""
+        own_s, images = self._own_s(index), self._config.motion_blur
+        colour, view = self._render(own_s)
         self._latest = index, view
         if images > 1:
             offsets_s = ((np.arange(images) + 0.5) / images - 0.5) * EXPOSURE_S
-            renders = (self._raycaster.render(self._path(time_s + float(offset)))[0] for offset in offsets_s)
+            renders = (self._render(own_s + float(offset))[0] for offset in offsets_s)
             colour = sum(renders, np.zeros_like(colour)) / np.float32(images)
         if self._config.exposure_change > 0:
-            gain = sensor.exposure_gain(time_s, self._config.exposure_change)
+            gain = sensor.exposure_gain(own_s, self._config.exposure_change)
             colour = np.clip(colour * np.float32(gain), 0.0, 1.0)
         return colour, view

@@ -31,6 +31,14 @@ class Correction:
     motions: dict[int, Matrix4]  # p_w <- motion p_w, for the keyframes that have moved; empty = stay where you are
     closures: tuple[int, ...]  # earlier keyframes to which it has an edge now
     ties: tuple[tuple[int, int], ...]  # keyframes between which closures have moved something for the first time
+    joined: int | None = None  # the first keyframe of a piece of the map that is tied to another one now
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """For the log."""
+        pieces = () if self.joined is None else (f"the piece of the map from keyframe {self.joined} on is joined",)
+        edges = (f"closures with keyframes {', '.join(map(str, self.closures))}",) if self.closures else ()
+        return pieces + edges
 
 
 class GraphClosing:
@@ -68,6 +76,7 @@ class GraphClosing:
             self._add_sightings(world.planes)
         T_cw = self._graph.optimise().T_cw
         by_planes, by_looks = self._structure_closures(world, T_cw), self._loop_closures(world, T_cw)
+        joined = self._join(world, T_cw, by_looks)
         for closure, robust in [(c, True) for c in by_planes] + [(c, False) for c in by_looks]:
             self._graph.add_closure(closure.earlier, latest, closure.measured.motion, robust=robust)
         found = tuple(closure.earlier for closure in (*by_planes, *by_looks))
@@ -78,7 +87,7 @@ class GraphClosing:
         ties = tuple(self._untied) if motions else ()
         if motions:
             self._untied = []
-        return Correction(motions, found, ties)
+        return Correction(motions, found, ties, joined)
 
     def _add_odometry(self, keyframe: Keyframe, latest: int, owners: Mapping[int, float]) -> None:
         """Tracking measures a pose against the map, that is, against the keyframes that its Gaussians were seeded from.
@@ -136,7 +145,23 @@ class GraphClosing:
         """Of the latest keyframe with earlier ones that look the same."""
         if self._loops is None:
             return ()
-        return self._loops.find(world.looks, dict(enumerate(T_cw)), self._graph.relative).closures
+        apart = world.pieces.others(len(world.keyframes) - 1)
+        return self._loops.find(world.looks, dict(enumerate(T_cw)), self._graph.relative, apart).closures
+
+    def _join(self, world: Map, T_cw: NDArray[np.float64], closures: tuple[Closure, ...]) -> int | None:
+        """Where a closure ties two pieces of the map, the later one goes where it says; returns its first keyframe.
+
+        From where the piece has been, which is anywhere, solving would not find there.
+        """
+        latest = len(world.keyframes) - 1
+        for closure in closures:
+            if world.pieces.of(closure.earlier) == world.pieces.of(latest):
+                continue
+            moved = world.pieces.join(closure.earlier, latest)
+            motion = inverse(closure.measured.T_ji @ T_cw[closure.earlier]) @ T_cw[latest]
+            self._graph.carry(moved, motion if latest in moved else inverse(motion))
+            return moved[0]
+        return None
 
     def _motions(self, T_cw: NDArray[np.float64]) -> dict[int, Matrix4]:
         """Of all keyframes once one of them has moved enough to matter."""

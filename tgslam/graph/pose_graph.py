@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -120,6 +120,17 @@ class PoseGraph:
                 if values.exists(plane_key(plane_id)):
                     values.erase(plane_key(plane_id))
         self.add_plane_observations([Sighting(k, plane_id, plane) for k, plane in views.items() if k not in same])
+
+    def carry(self, keyframes: Iterable[int], motion: Vector) -> None:
+        """Keyframes and the planes that they saw are elsewhere, p_w <- motion p_w [4, 4]: `optimise` starts there."""
+        carried, pose = set(keyframes), gtsam.Pose3(motion)
+        for keyframe in carried:
+            self._values.update(pose_key(keyframe), pose.compose(self._pose_of(keyframe)))
+        for plane_id, views in self._sightings.items():
+            for keyframe in [k for k in views if k in carried][-1:]:
+                world = views[keyframe].transformed(self._pose_of(keyframe).matrix())
+                self._values.update(plane_key(plane_id), gtsam.OrientedPlane3(np.append(world.normal, world.offset_m)))
+        self._solver, self._change = make_solver(self._config), self._everything()
 
     def optimise(self) -> GraphEstimate:
         """Take in what was added and solve.

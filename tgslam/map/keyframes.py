@@ -45,6 +45,7 @@ class Keyframe:
         limit = np.iinfo(np.uint16).max
         units = np.rint(runtime.to_host(frame.depth_m) / _DEPTH_UNIT_M)
         self._depth = np.where(units <= limit, units, 0).astype(np.uint16)
+        self._left_out: NDArray[np.bool_] | None = None
         self._labels: PlaneLabels | None = None
         self._label_version = 0
         self._decoded: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
@@ -62,6 +63,18 @@ class Keyframe:
     def expose(self, exposure: Exposure) -> None:
         """Its exposure has become better known."""
         self._exposure = exposure
+
+    @property
+    def left_out(self) -> NDArray[np.bool_] | None:
+        """[H, W] pixels that show nothing of the world that stays; None = there are none."""
+        return self._left_out
+
+    def leave_out(self, pixels: NDArray[np.bool_]) -> None:
+        """Of these pixels [H, W], neither depth nor colour counts from now on."""
+        if pixels.any():
+            self._left_out, self._depth = pixels, np.where(pixels, 0, self._depth).astype(np.uint16)
+            kept, self._decoded = self._decoded is not None, None
+            self.keep_decoded(kept)
 
     @property
     def labels(self) -> PlaneLabels | None:

@@ -10,6 +10,7 @@ import numpy as np
 from tgslam.camera import Camera, SensorNoise
 from tgslam.map.gaussians import GaussianMap
 from tgslam.map.keyframes import Keyframes
+from tgslam.map.pieces import Pieces
 from tgslam.recognition.looks import Looks
 from tgslam.types import Matrix4, Plane
 
@@ -31,7 +32,7 @@ class Map:
         """
         self.camera, self.noise = camera, noise
         self.keyframes, self.looks = Keyframes(camera, noise), Looks(camera, noise, loops)
-        self.gaussians = GaussianMap()
+        self.gaussians, self.pieces = GaussianMap(), Pieces()
         self.planes = _registry(planes, noise, self.keyframes.T_wc) if planes and planes.enabled else None
 
     def move(self, motions: Mapping[int, Matrix4], *, carry: bool = True) -> None:

@@ -92,7 +92,7 @@ class Growth:
             depth_m = np.where((planes.depth_m > 0) & (images.depth_m <= 0), planes.depth_m, depth_m)
             normals_c = np.where(planes.depth_m[..., None] > 0, planes.normals_c, normals_c)
         ids = planes.ids if planes else None
-        colour = exposure.gain * images.colour + np.float32(exposure.bias)
+        colour = exposure.gain * exposure.balanced(images.colour) + np.float32(exposure.bias)
         return _Completed(Quadtree(colour, depth_m, self._seeding, self._noise, ids), sound, normals_c, ids)
 
     def _disproved(self, world: Map, surface: Surface) -> NDArray[np.bool_]:
@@ -127,7 +127,8 @@ class Growth:
     def _insert(self, world: Map, completed: _Completed) -> None:
         """Seed Gaussians where the map is open; where no depth was measured, at a guessed one."""
         measured_m, T_cw = world.keyframes.latest_images.depth_m, world.keyframes[-1].T_cw
-        cells = completed.quadtree.leaves(self._unexplained(world, T_cw, measured_m))
+        unexplained, left_out = self._unexplained(world, T_cw, measured_m), world.keyframes[-1].left_out
+        cells = completed.quadtree.leaves(unexplained if left_out is None else unexplained & ~left_out)
         latest, ids = len(world.keyframes) - 1, completed.plane_ids
         new = seed(cells, completed.normals_c, self._camera, T_cw, latest, self._seeding, ids)
         if self._structure:

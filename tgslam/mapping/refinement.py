@@ -26,6 +26,7 @@ from tgslam.ops.splats import MapGradient
 from tgslam.types import Matrix4
 
 _GEOMETRY = {"mean": 3, "log_scale": 3, "quat_wxyz": 4, "opacity_logit": 0}
+Balance = tuple[float, float, float]
 _MOMENTS, _STEPS = "adam_moments", "adam_steps"
 
 
@@ -61,7 +62,7 @@ class Refiner:
         gaussians.add_columns((Column(_MOMENTS, self._adam.moment_width), Column(_STEPS, dtype=np.int32)))
         self._gradient = MapGradient.zeros(1)
         self._workspace = losses.Workspace(camera.height, camera.width)
-        self._observations: OrderedDict[int, losses.Observation] = OrderedDict()
+        self._observations: OrderedDict[tuple[int, Balance], losses.Observation] = OrderedDict()
 
     def step(
         self, keyframe: Keyframe, T_cw: Matrix4 | None = None, *, pace: float = 1.0, colour_pace: float = 1.0
@@ -134,11 +135,14 @@ class Refiner:
 
     def _observation(self, keyframe: Keyframe) -> losses.Observation:
         """The keyframe's side of the loss; the most recently used are kept."""
-        cached = self._observations.pop(keyframe.index, None)
+        key = keyframe.index, keyframe.exposure.balance
+        cached = self._observations.pop(key, None)
         if cached is None:
-            colour, depth_m = runtime.to_device(keyframe.colour()), runtime.to_device(keyframe.depth_m())
-            cached = losses.observe(colour, depth_m, self.loss)
-        self._observations[keyframe.index] = cached
+            colour, depth_m = keyframe.exposure.balanced(keyframe.colour()), keyframe.depth_m()
+            left_out = keyframe.left_out
+            mask = None if left_out is None else runtime.to_device((~left_out).astype(np.float32))
+            cached = losses.observe(runtime.to_device(colour), runtime.to_device(depth_m), self.loss, mask)
+        self._observations[key] = cached
         while len(self._observations) > self.config.window + self.config.anchor_count:
             self._observations.popitem(last=False)
         return cached

@@ -86,13 +86,18 @@ class Raycaster:
         self._material = runtime.to_device(scene.material)
         self._occlusion = runtime.to_device(scene.occlusion.share)
 
-    def view(self, T_wc: Matrix4) -> View:
-        """Geometry of the view from T_wc [4, 4] (camera to world)."""
-        return _on_host(self._cast(*self._primitives(camera_scene(self._scene, self._camera, T_wc))))
+    def view(self, T_wc: Matrix4, moved: Scene | None = None) -> View:
+        """Geometry of the view from T_wc [4, 4] (camera to world). moved: the scene with primitives elsewhere."""
+        return _on_host(
+            self._cast(*self._primitives(camera_scene(self._scene if moved is None else moved, self._camera, T_wc)))
+        )
 
-    def render(self, T_wc: Matrix4) -> tuple[FloatImage, View]:
-        """Colour [H, W, 3] float32 in [0, 1] and geometry of the view from T_wc [4, 4] (camera to world)."""
-        local = camera_scene(self._scene, self._camera, T_wc)
+    def render(self, T_wc: Matrix4, moved: Scene | None = None) -> tuple[FloatImage, View]:
+        """Colour [H, W, 3] float32 in [0, 1] and geometry of the view from T_wc [4, 4] (camera to world).
+
+        moved: the scene with primitives elsewhere.
+        """
+        local = camera_scene(self._scene if moved is None else moved, self._camera, T_wc)
         primitives, lists = self._primitives(local)
         view = self._cast(primitives, lists)
         colour = runtime.empty((*self._camera.shape, 3))

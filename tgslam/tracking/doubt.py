@@ -15,6 +15,7 @@ _HISTORY = 30  # tracked frames whose misfit says what is usual here: a second
 _MIN_HISTORY = 3  # of them, for their median to say anything
 _UNUSUAL = 1.5  # times the usual misfit
 _MEMORY = 0.8  # of how far predictions were off, from a frame to the next
+_CONVINCING = 0.5  # of a frame's pixels agree with the map, where nothing else says that the camera is there
 _UNMATCHED = 3.0  # standard deviations that a pixel is taken to be off whose depth does not match at all
 
 
@@ -43,6 +44,17 @@ class Doubt:
         self._reach_px = camera.width / coarsest.width
         self._off_px = np.inf  # how far predictions were off of late: nothing is known yet
         self._misfits: deque[float] = deque(maxlen=_HISTORY)
+        self.lost = False  # the last frame was
+
+    def convincing(self, result: TrackingResult) -> bool:
+        """Whether alignment alone shows that the camera is there, when it may have been carried anywhere.
+
+        A wall, or a hand before the lens, meets some piece of the map from almost anywhere.
+        """
+        if result.lost:
+            return False
+        known = len(self._misfits) < _MIN_HISTORY or not self._unusual(result)
+        return known and result.measures["overlap"] * result.measures["agreement"] >= _CONVINCING
 
     def about(self, result: TrackingResult, predicted: NDArray[np.float64], median_m: float) -> bool:
         """Whether a frame that was predicted at T_cw [4, 4] may well be elsewhere. median_m: its depth."""
@@ -56,10 +68,11 @@ class Doubt:
         known = np.isfinite(self._off_px)
         self._off_px = max(off_px, _MEMORY * self._off_px) if known else off_px
         self._misfits.append(misfit(result))
+        self.lost = False
 
     def forget(self) -> None:
         """The camera was lost: nothing is known of how it moves."""
-        self._off_px = np.inf
+        self._off_px, self.lost = np.inf, True
 
     def _unusual(self, result: TrackingResult) -> bool:
         if len(self._misfits) < _MIN_HISTORY:

@@ -13,13 +13,16 @@ from tgslam.config.pose_settings import PosesConfig
 from tgslam.config.tracking_settings import TrackingConfig
 from tgslam.device import runtime
 from tgslam.geometry import inverse
+from tgslam.map.free_space import intruding
 from tgslam.map.keyframes import Keyframe
+from tgslam.map.pieces import nearest
 from tgslam.map.world import Map
 from tgslam.ops import image as images
 from tgslam.recognition.verification import Look
 from tgslam.tracking.brightness import KeyframeExposures
 from tgslam.tracking.doubt import Doubt
 from tgslam.tracking.hypotheses import Place, Sighted, recognised
+from tgslam.tracking.lost import Patience
 from tgslam.tracking.motion import MotionFilter
 from tgslam.tracking.references import Reference, references_of
 from tgslam.tracking.result import TrackingResult
@@ -37,7 +40,7 @@ class FrontEnd:
         self.tracker = make_tracker(camera, config, loss)
         self._camera, self._config, self._poses = camera, config, poses
         self._motion = MotionFilter(config.expert.motion)
-        self._doubt = Doubt(camera, coarsest(camera, config))
+        self._doubt, self._patience = Doubt(camera, coarsest(camera, config)), Patience()
         self._exposure, self._exposures = Exposure(), KeyframeExposures(camera)
         self._look: Look | None = None  # of the last frame, where it has been looked at
         self._previous: Look | tuple[FloatImage, FloatImage] | None = None  # the last frame, unless that is lost
@@ -48,7 +51,8 @@ class FrontEnd:
 
     def track(self, frame: Frame, world: Map, latest_T_cw: Matrix4, T_wc: Matrix4 | None = None) -> TrackingResult:
         """The frame's pose, from where motion leads. Where that is in doubt, places count too where it is recognised;
-        if it is lost, also those of the last frame, T_cw [4, 4], and of the latest keyframes.
+        if it is lost, also those of the last frame, T_cw [4, 4], and of the latest keyframes. Where nothing is
+        known for long, a new piece of the map begins.
 
         T_wc: [4, 4] as it is known beforehand: what the settings say of such poses goes before motion.
         """
@@ -58,6 +62,8 @@ class FrontEnd:
         if T_wc is not None:
             predicted, prior = inverse(T_wc), self._poses.information
         first = self.tracker.track(frame, world.gaussians, predicted, self._exposure, prior, firm=T_wc is not None)
+        if self._doubt.lost and not self._doubt.convincing(first):
+            first = _not_there(first)
         self._look, median_m = None, images.median_of_measured(runtime.to_device(frame.depth_m))
         found = first
         if first.lost or (T_wc is None and self._doubt.about(first, predicted, median_m)):
@@ -65,7 +71,8 @@ class FrontEnd:
         self._previous = None if found.lost else self._look or _copied(frame)
         if found.lost:
             self._doubt.forget()
-            return replace(first, T_cw=predicted, exposure=self._exposure)
+            return self._not_found(replace(first, T_cw=predicted, exposure=self._exposure), world)
+        self._patience.reset()
         if found is not first:
             self.tracker.rasterizer.forward(world.gaussians, found.T_cw)
         self._doubt.settle(found, predicted, median_m)
@@ -84,7 +91,8 @@ class FrontEnd:
         if self._previous is not None:
             look = self._previous if isinstance(self._previous, Look) else world.looks.of(*self._previous)
             previous = Sighted(look, latest_T_cw)
-        place = recognised(self._look, world, previous, anywhere=first.lost)
+        known = self._config.recognition
+        place = recognised(self._look, world, previous, anywhere=first.lost) if known else None
         if place is not None and (first.lost or not place.agrees(first.T_cw)):
             found = self._at(frame, world, place)
             if not found.lost:
@@ -93,7 +101,7 @@ class FrontEnd:
             return first
         others = [latest_T_cw, *(keyframe.T_cw for keyframe in world.keyframes[: -_FALLBACKS - 1 : -1])]
         results = (self.tracker.track(frame, world.gaussians, T_cw, self._exposure) for T_cw in others)
-        return next((result for result in results if not result.lost), first)
+        return next((result for result in results if self._doubt.convincing(result)), first)
 
     def _at(self, frame: Frame, world: Map, place: Place) -> TrackingResult:
         """Aligned from a place to start. Where that leads away, the map does not show yet what is there: it stays."""
@@ -103,15 +111,38 @@ class FrontEnd:
         stays = self.tracker.assess(frame, world.gaussians, place.T_cw, self._exposure)
         return replace(stays, information=place.information)
 
+    def _not_found(self, lost: TrackingResult, world: Map) -> TrackingResult:
+        """Lost, or the beginning of a new piece of the map."""
+        if self._look is None or not self._patience.ends(len(self._look.features)):
+            return lost
+        self._patience.reset()
+        self._previous = self._look
+        return TrackingResult(world.pieces.start(lost.T_cw), lost.exposure, np.zeros((6, 6)), lost=False, begins=True)
+
+    def elsewhere(self, result: TrackingResult, world: Map) -> str:
+        """Why the frame has to be a keyframe since it is in another piece of the map than the latest one; "" if not."""
+        if result.begins:
+            return "a new piece of the map begins"
+        near = nearest(result.T_cw, world.keyframes.T_cw())
+        return "" if world.pieces.of(near) == world.pieces.of(-1) else "back in another piece of the map"
+
     def tracked_view(self, world: Map) -> NDArray[np.bool_]:
         """[N] Gaussians in view of the last frame, as of the rendering that it was aligned to."""
         return self.tracker.rasterizer.visible(world.gaussians.count)
 
     def keyframe(self, frame: Frame, result: TrackingResult, world: Map) -> Keyframe:
-        """Add the tracked frame to the map's keyframes, as bright as the others show the same surfaces."""
+        """Add the tracked frame to the map's keyframes, as bright as the others show the same surfaces.
+
+        What has come in front of what they saw does not count.
+        """
         keyframe = Keyframe(frame, result.T_cw, result.exposure, result.information)
+        if result.begins or not world.keyframes:
+            world.pieces.begin()
+        else:
+            world.pieces.add(nearest(result.T_cw, world.keyframes.T_cw()))
         world.keyframes.add(keyframe)
         world.looks.add(self._look or world.looks.of(frame.colour, frame.depth_m))
+        keyframe.leave_out(intruding(world, len(world.keyframes) - 1))
         if self._config.exposure == "gain":
             self._exposures.add(world.keyframes)
         return keyframe
@@ -149,6 +180,14 @@ class FrontEnd:
     def _reference(self, world: Map, number: int) -> Reference:
         keyframe, planes_c = world.keyframes[number], steadying_planes(world, number)
         return Reference(keyframe.colour(), keyframe.depth_m(), keyframe.T_cw, keyframe.exposure, planes_c)
+
+
+def _not_there(result: TrackingResult) -> TrackingResult:
+    """Lost, though what was aligned would do where the camera is known to be near."""
+    if result.lost:
+        return result
+    overlap, agreement = result.measures["overlap"], result.measures["agreement"]
+    return replace(result, lost=True, message=f"only {overlap * agreement:.0%} of the frame agrees with the map")
 
 
 def _median(depth_m: FloatImage) -> float:

@@ -10,6 +10,8 @@ from tgslam.config.tracking_settings import LostSettings
 
 _HISTORY = 30  # tracked frames whose colour residual says what is usual here: a second
 _MIN_HISTORY = 3  # of them, for their median to say anything
+_PATIENCE = 15  # lost frames in a row that show something: half a second
+_SOMETHING = 30  # features with depth: a place is recognised by hardly fewer
 
 
 class LostDetector:
@@ -52,3 +54,22 @@ class LostDetector:
             return np.inf
         median = float(np.median(self._colour_residuals))
         return max(self._config.max_colour_ratio * median, self._config.sound_colour_residual)
+
+
+class Patience:
+    """How long a lost camera has looked at something that it does not know.
+
+    Frames that are dark, covered or blurred say nothing, and neither does a blank wall.
+    """
+
+    def __init__(self) -> None:
+        self._frames = 0
+
+    def ends(self, features: int) -> bool:
+        """Whether it is time for a new piece of the map, now that another lost frame shows so many features."""
+        self._frames = self._frames + 1 if features >= _SOMETHING else 0
+        return self._frames >= _PATIENCE
+
+    def reset(self) -> None:
+        """The camera is not lost any more."""
+        self._frames = 0

@@ -20,3 +20,4 @@ class TrackingResult:
     lost: bool
     message: str = ""  # the evidence, where lost
     measures: dict[str, float] = field(default_factory=dict)  # for the log
+    begins: bool = False  # a new piece of the map: of where the old ones are from here, nothing is known

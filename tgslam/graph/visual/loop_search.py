@@ -38,28 +38,39 @@ class LoopSearch:
     def __init__(self, config: LoopConfig) -> None:
         self._config = config
 
-    def find(self, looks: Looks, T_cw: Mapping[int, Vector], relative: Relative) -> Findings:
+    def find(
+        self,
+        looks: Looks,
+        T_cw: Mapping[int, Vector],
+        relative: Relative,
+        apart: NDArray[np.bool_] | None = None,
+    ) -> Findings:
         """At most one closure of the latest keyframe, the last one of `looks`.
 
         T_cw: [4, 4] of each keyframe so far, and `relative` between two of them, as the graph has it
-        (`PoseGraph.relative`).
+        (`PoseGraph.relative`). apart: [K] those of which the graph does not know where they are from the latest one;
+        None = it does of all.
         """
         latest = len(looks) - 1
-        best, unconfirmed = self._recognised(looks, self._alike(looks.scores(looks[latest])[:latest]), T_cw)
+        apart = np.zeros(latest + 1, bool) if apart is None else apart
+        best, unconfirmed = self._recognised(looks, self._alike(looks.scores(looks[latest]), apart), T_cw)
         if best is None:
             return Findings((), unconfirmed, gated=0)
         measured = looks.verification.refined(best.same, looks[best.keyframe], looks[latest])
+        if apart[best.keyframe]:
+            return Findings((Closure(best.keyframe, (), measured),), unconfirmed, gated=0)
         T_ji, covariance = relative(best.keyframe, latest)
         drift = self._config.expert.confirmation.understated**2 * covariance
         if not passes(measured, T_ji, drift, self._config.expert.acceptance.gate_probability):
             return Findings((), unconfirmed, gated=1)
         return Findings((Closure(best.keyframe, (), measured),), unconfirmed, gated=0)
 
-    def _alike(self, scores: Vector) -> list[int]:
+    def _alike(self, scores: Vector, apart: NDArray[np.bool_]) -> list[int]:
         """The most alike of the earlier keyframes that are no neighbours, best first; of equal ones the oldest."""
-        old = scores[: max(len(scores) - self._config.loop_gap, 0)]
-        best = np.argsort(-old, kind="stable")[: self._config.candidates]
-        return [int(keyframe) for keyframe in best if old[keyframe] > 0.0]
+        neighbours = np.arange(len(scores)) >= len(scores) - 1 - self._config.loop_gap
+        candidates = np.where(neighbours & ~apart, 0.0, scores)
+        best = np.argsort(-candidates, kind="stable")[: self._config.candidates]
+        return [int(keyframe) for keyframe in best if candidates[keyframe] > 0.0]
 
     def _recognised(
         self, looks: Looks, keyframes: list[int], T_cw: Mapping[int, Vector]
