@@ -17,7 +17,8 @@ from tests.tiers import changed
 from tgslam.config.input_settings import SyntheticConfig
 from tgslam.config.schema import Config
 from tgslam.datasets.built_in import SyntheticSource
-from tgslam.geometry import inverse, transform_points
+from tgslam.geometry import inverse, se3_exp, transform_points
+from tgslam.map.pieces import Pieces
 from tgslam.slam import Slam
 from tgslam.types import FrameReport, FrameStatus
 
@@ -130,3 +131,25 @@ def test_what_moves_leaves_no_ghost() -> None:
     one = played("moving_box")
     assert any(keyframe.left_out is not None for keyframe in one.slam.map.keyframes)
     assert one.floaters() < 0.003 * len(one.slam.gaussians())
+
+
+def test_pieces_that_nothing_ties_go_where_the_camera_was_led() -> None:
+    pieces, T_cw, by = (
+        Pieces(),
+        [np.eye(4)],
+        [se3_exp([0.1, 0.2, -0.3, 1.0, 2.0, 3.0]), se3_exp([0.3, 0, 0, -1, 0.5, 0])],
+    )
+    pieces.begin()
+    for motion in by:
+        T_cw.append(pieces.start(motion @ T_cw[-1], T_cw[-1]))
+        pieces.begin()
+    first, second = by[0], by[1] @ by[0]  # where motion led, from each to the next
+    T_wc = dict(enumerate(inverse(np.array(T_cw))))
+    motions = pieces.led(T_wc)
+    np.testing.assert_allclose(motions[1] @ T_wc[1], inverse(first), atol=1e-9)
+    np.testing.assert_allclose(motions[2] @ T_wc[2], inverse(second), atol=1e-9)
+    tied = se3_exp([0.0, 0.1, 0.0, 0.3, 0.0, 0.0])
+    pieces.join(0, 1)
+    motions = pieces.led({**T_wc, 1: tied})  # where a closure has found it to be
+    assert sorted(motions) == [2]
+    np.testing.assert_allclose(motions[2] @ T_wc[2], tied @ inverse(by[1]), atol=1e-9)

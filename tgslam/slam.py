@@ -37,8 +37,7 @@ class Slam:
     def process_frame(self, frame: Frame, T_wc: Matrix4 | None = None) -> FrameReport:
         """Estimate the frame's pose and, if it shows something new, map it. Frames come in order of time.
 
-        T_wc: the pose as it is known, if it is. Raises FrameError, with nothing changed, for a frame with next to no
-        depth or of another size than the camera's.
+        T_wc: the pose, if it is known. Raises FrameError, with nothing changed, for another size or next to no depth.
         """
         record = FrameRecord(frame)
         with record.stage("prepare"):
@@ -104,10 +103,11 @@ class Slam:
             self.front_end.move(correction.motions[len(self.map.keyframes) - 1])
 
     def finish(self) -> None:
-        """The final refinement of the map, after the last frame."""
+        """The final refinement of the map, after the last frame; what is apart goes where motion has led."""
         if self._planes and self.map.keyframes:
             self._planes.complete(self.map)
         self._refinement.finish()
+        self.map.gather()
 
     def trajectory(self) -> Trajectory:
         """Camera-to-world poses of every frame that was given."""

@@ -63,7 +63,7 @@ def counts(reports: Sequence[FrameReport]) -> dict[str, Any]:
     return {
         "frames": len(reports),
         "frames_skipped": fates[FrameStatus.SKIPPED],
-        "frames_lost": fates[FrameStatus.LOST],
+        "frames_lost": fates[FrameStatus.LOST] + fates[FrameStatus.APART],
         "tracked_fraction": used / len(reports) if reports else None,
         "keyframes": sum(report.is_keyframe for report in reports),
         "gaussians": reports[-1].gaussians if reports else 0,

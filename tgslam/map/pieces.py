@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,12 +20,26 @@ class Pieces:
     def __init__(self) -> None:
         self._of: list[int] = []
         self._begun = 0
+        self._led: dict[int, tuple[int, Matrix4]] = {}  # by piece: the keyframe before, and from there where it began
 
-    def start(self, T_cw: Matrix4) -> Matrix4:
-        """[4, 4] where the next piece is put, apart from all others, as upright as T_cw [4, 4] says that it is."""
+    def start(self, T_cw: Matrix4, latest_T_cw: Matrix4) -> Matrix4:
+        """[4, 4] where the next piece is put, apart from all others, as upright as T_cw [4, 4] says that it is.
+
+        T_cw: where motion has led, and latest_T_cw: [4, 4] from the latest keyframe.
+        """
         T_wc = inverse(T_cw)
+        self._led[len(self._of)] = len(self._of) - 1, latest_T_cw @ T_wc
         T_wc[:3, 3] = (self._begun * _APART_M) * _ALONG
         return inverse(T_wc)
+
+    def led(self, T_wc: Mapping[int, Matrix4]) -> dict[int, Matrix4]:
+        """By keyframe of the pieces that nothing ties to the first one, the motion p_w <- motion p_w [4, 4] to where
+        the camera was led, as far as is known. T_wc: [4, 4] of all keyframes.
+        """
+        motions = {0: np.eye(4)}
+        for first, (earlier, T_ec) in self._led.items():
+            motions[first] = motions[self._of[earlier]] @ T_wc[earlier] @ T_ec @ inverse(T_wc[first])
+        return {number: motions[piece] for number, piece in enumerate(self._of) if piece != 0}
 
     def begin(self) -> None:
         """The next keyframe is the first one of a piece."""

@@ -49,6 +49,12 @@ class Map:
         if self.planes:
             self.planes.follow(motions)
 
+    def gather(self) -> None:
+        """Pieces that nothing ties to the first one go where the camera was led, which is the best that is known."""
+        motions = self.pieces.led(self.keyframes.T_wc)
+        if motions:
+            self.move(motions)
+
     def planes_seen_from(self, number: int) -> list[PlanarInstance]:
         """The persistent planes that a keyframe saw."""
         if not self.planes:

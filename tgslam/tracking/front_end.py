@@ -117,7 +117,8 @@ class FrontEnd:
             return lost
         self._patience.reset()
         self._previous = self._look
-        return TrackingResult(world.pieces.start(lost.T_cw), lost.exposure, np.zeros((6, 6)), lost=False, begins=True)
+        T_cw = world.pieces.start(lost.T_cw, world.keyframes[-1].T_cw)
+        return TrackingResult(T_cw, lost.exposure, np.zeros((6, 6)), lost=False, begins=True)
 
     def elsewhere(self, result: TrackingResult, world: Map) -> str:
         """Why the frame has to be a keyframe since it is in another piece of the map than the latest one; "" if not."""
