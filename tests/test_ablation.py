@@ -178,6 +178,7 @@ def test_interruption_leaves_what_is_finished(
     assert "| on | 1.00 | 3.00 | 1 of 2 |" in (tmp_path / "gate.md").read_text()
 
 
+@pytest.mark.long
 def test_a_whole_study_of_real_runs(tmp_path: Path) -> None:
     settings = ("synthetic.width=64", "synthetic.height=48", "mapping.final_iterations=0", "planes.enabled=false")
     small = [f"--set={text}" for text in settings]

@@ -215,7 +215,7 @@ def test_depth_of_half_the_size_is_brought_to_colours(folder: Path, caplog: pyte
     small = np.stack([large[a::2, b::2] for a in (0, 1) for b in (0, 1)]).mean(axis=0)
     np.save(folder / "depth/5.00.npy", small)
     write_list(folder, "depth", "{t:.2f} depth/5.00.npy")
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level(logging.INFO, logger="tgslam"):
         depth_m = opened(folder).read(0).depth_m
     assert "depth is 16x12, and is brought to colour's size" in caplog.text
     assert set(np.unique(depth_m[:, W // 2 :])) == {np.float32(2.0)}

@@ -194,7 +194,7 @@ def test_a_recording_with_a_depth_camera_of_its_own(tmp_path: Path) -> None:
 
 
 def test_depth_of_another_resolution_shows_the_same_view(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO)
+    caplog.set_level(logging.INFO, logger="tgslam")
     half = Camera(30, 20, 27.5, 27.0, 14.75, 9.25)  # what COLOUR is in blocks of 2x2
     source = opened(write(tmp_path, plane_depth(half), COLOUR))
     depth_m = source.read(0).depth_m

@@ -44,7 +44,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -54,7 +54,7 @@ import pytest
 from tests.cuda import scenarios
 from tools.cudacheck.budgets import BUDGETS_FILE, with_headroom, write_budgets
 from tools.cudacheck.environment import Grid, environment, reports
-from tools.cudacheck.ptxas import ARCHITECTURES, Usage, usage
+from tools.cudacheck.ptxas import Usage, usage
 
 Results = dict[str, np.ndarray]
 Scenario = Callable[..., Results]
@@ -118,11 +118,11 @@ class Devices:
         """What a scenario gives on the CPU device and as CUDA kernels."""
         return self.cpu(function, **arguments), self.cuda(function, grid, **arguments)
 
-    def usage(self, architectures: Iterable[str] = ARCHITECTURES) -> list[Usage]:
+    def usage(self) -> list[Usage]:
         """What all kernels of all scenarios take of a GPU. Raises MissingToolError without ptxas."""
         for function in all_scenarios():
             self.cuda(function)
-        return usage(self._folder.glob(f"{Grid.DEFAULT.value}-*"), architectures)
+        return usage(self._folder.glob(f"{Grid.DEFAULT.value}-*"))
 
     def close(self) -> None:
         """End all processes."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.cuda.harness import GRIDS, Devices
+from tests.cuda.harness import Devices
 from tests.cuda.scenarios import refinement
 from tgslam.map.gaussians import PARAMETERS
 from tools.cudacheck.environment import Grid
@@ -13,7 +13,9 @@ from tools.cudacheck.environment import Grid
 pytestmark = pytest.mark.cuda_check
 
 
-@pytest.mark.parametrize("grid", GRIDS)
+@pytest.mark.parametrize(
+    "grid", [grid if grid is Grid.DEFAULT else pytest.param(grid, marks=pytest.mark.long) for grid in Grid]
+)
 def test_the_map_and_the_pose_move_alike(devices: Devices, grid: Grid) -> None:
     """With planes: then the kernels of the others take part as well."""
     _compare(devices, grid, "relaxation", planes=True)

@@ -97,14 +97,23 @@ class StepSizeSettings:
     """How far a step of refinement goes. All but colour_relaxation are rates of Adam: the size of a step."""
 
     rate_mean_px: float = setting(0.15, 0.0, 10.0, doc="Of means, px at a depth of 1 m.")
-    rate_scale: float = setting(0.06, 0.0, 1.0, doc="Of scales, in their logarithm.")
-    rate_rotation: float = setting(0.01, 0.0, 1.0, doc="Of rotations, in components of the unit quaternion.")
-    rate_opacity: float = setting(0.1, 0.0, 10.0, doc="Of opacities, in their logit.")
+    rate_scale: float = setting(0.005, 0.0, 1.0, doc="Of scales, in their logarithm.")
+    rate_rotation: float = setting(0.002, 0.0, 1.0, doc="Of rotations, in components of the unit quaternion.")
+    rate_opacity: float = setting(0.03, 0.0, 10.0, doc="Of opacities, in their logit.")
     rate_colour: float = setting(0.01, 0.0, 1.0, doc="Of colours, intensity in [0, 1]; only with optimizer: adam.")
     rate_pose: float = setting(0.0003, 0.0, 1.0, doc="Of keyframe poses, rad and m; only with refine_poses.")
     colour_relaxation: float = setting(
         0.7, 0.0, 1.9, doc="Part of the full step of colours that is taken; only with optimizer: relaxation."
     )
+
+
+@dataclass(frozen=True)
+class FinalStepSettings:
+    """How far a step goes in the final pass, where it differs: every view has its turn, so that none is forgotten."""
+
+    final_rate_scale: float = setting(0.06, 0.0, 1.0, doc="Of scales, in their logarithm.")
+    final_rate_rotation: float = setting(0.01, 0.0, 1.0, doc="Of rotations, in components of the unit quaternion.")
+    final_rate_opacity: float = setting(0.1, 0.0, 10.0, doc="Of opacities, in their logit.")
 
 
 @dataclass(frozen=True)
@@ -114,6 +123,7 @@ class MappingExpert:
     insertion: InsertionSettings = field(default_factory=InsertionSettings)
     pruning: PruningSettings = field(default_factory=PruningSettings)
     step_sizes: StepSizeSettings = field(default_factory=StepSizeSettings)
+    final_step_sizes: FinalStepSettings = field(default_factory=FinalStepSettings)
 
 
 @dataclass(frozen=True)

@@ -58,20 +58,26 @@ class Refiner:
         self.gaussians, self.config, self.loss, self.stopwatch = gaussians, config, loss, stopwatch
         self.structure = StructureTerms(camera, structure, config.window + config.anchor_count) if structure else None
         self.rasterizer = Rasterizer(camera)
-        self._adam = _optimiser(config, camera)
+        self._adam, self._final_adam = _optimiser(config, camera), _optimiser(config, camera, final=True)
         gaussians.add_columns((Column(_MOMENTS, self._adam.moment_width), Column(_STEPS, dtype=np.int32)))
         self._gradient = MapGradient.zeros(1)
         self._workspace = losses.Workspace(camera.height, camera.width)
         self._observations: OrderedDict[tuple[int, Balance], losses.Observation] = OrderedDict()
 
     def step(
-        self, keyframe: Keyframe, T_cw: Matrix4 | None = None, *, pace: float = 1.0, colour_pace: float = 1.0
+        self,
+        keyframe: Keyframe,
+        T_cw: Matrix4 | None = None,
+        *,
+        pace: float = 1.0,
+        colour_pace: float = 1.0,
+        final: bool = False,
     ) -> Step:
         """Render the map at the keyframe and move it downhill.
 
         T_cw: [4, 4] where the keyframe is believed to be, by default its pose. pace: what the map's steps are
-        multiplied by, but for those of embeddings; colour_pace: and those of colours besides. Only the pose's gradient
-        goes to the host by itself.
+        multiplied by, but for those of embeddings; colour_pace: and those of colours besides. final: a step of the
+        final pass. Only the pose's gradient goes to the host by itself.
         """
         observation = self._observation(keyframe)
         target = self.structure.due(keyframe) if self.structure else None
@@ -88,7 +94,7 @@ class Refiner:
         with stage(self.stopwatch, "backward"):
             g_pose = self._backward(loss, pgi)
         with stage(self.stopwatch, "update"):
-            self._update(loss, pgi, pace, pace * colour_pace)
+            self._update(self._final_adam if final else self._adam, loss, pgi, pace, pace * colour_pace)
         return Step(loss, g_pose)
 
     def _backward(self, loss: losses.LossResult, pgi: InstanceGradient | None) -> NDArray[np.float64]:
@@ -106,14 +112,16 @@ class Refiner:
         )  # fmt: skip
         return self.rasterizer.backward(self.gaussians, g, self._gradient)
 
-    def _update(self, loss: losses.LossResult, pgi: InstanceGradient | None, pace: float, colour_pace: float) -> None:
+    def _update(
+        self, adam: Adam, loss: losses.LossResult, pgi: InstanceGradient | None, pace: float, colour_pace: float
+    ) -> None:
         gaussians, gradient, visible = self.gaussians, self._gradient, self.rasterizer.tile_count
         if self.structure:
             self.structure.regularise(gaussians, visible, gradient)
             if pgi:
                 self.structure.move_embeddings(gaussians, visible, gradient, pgi.target)
-        names = list(self._adam.learning_rates)
-        self._adam.step(
+        names = list(adam.learning_rates)
+        adam.step(
             gaussians.count,
             {name: gaussians.array(name) for name in names},
             {name: getattr(gradient, name) for name in names},
@@ -148,14 +156,14 @@ class Refiner:
         return cached
 
 
-def _optimiser(config: MappingConfig, camera: Camera) -> Adam:
+def _optimiser(config: MappingConfig, camera: Camera, *, final: bool = False) -> Adam:
     """Adam for the geometry, and for colours unless they relax."""
-    channels, sizes = dict(_GEOMETRY), config.expert.step_sizes
+    channels, sizes, last = dict(_GEOMETRY), config.expert.step_sizes, config.expert.final_step_sizes
     rates = {
         "mean": sizes.rate_mean_px / camera.fx,
-        "log_scale": sizes.rate_scale,
-        "quat_wxyz": sizes.rate_rotation,
-        "opacity_logit": sizes.rate_opacity,
+        "log_scale": last.final_rate_scale if final else sizes.rate_scale,
+        "quat_wxyz": last.final_rate_rotation if final else sizes.rate_rotation,
+        "opacity_logit": last.final_rate_opacity if final else sizes.rate_opacity,
     }
     if config.optimizer == "adam":
         channels["colour"], rates["colour"] = 3, sizes.rate_colour

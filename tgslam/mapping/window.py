@@ -83,7 +83,7 @@ class WindowRefinement:
         rounds = range(0, self._steps(max(config.final_iterations, least)), max(len(keyframes), 1))
         views = [k for _ in rounds for k in self._rng.permutation(len(keyframes))]
         for view, pace in zip(views, np.linspace(1.0, _FINAL_PACE, len(views)), strict=True):
-            self.refiner.step(keyframes[view], colour_pace=float(pace))
+            self.refiner.step(keyframes[view], colour_pace=float(pace), final=True)
         prune(self._world.gaussians, self._config.expert.pruning)
 
     def _steps(self, count: int) -> int:
