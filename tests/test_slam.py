@@ -92,7 +92,9 @@ def room_run(room: SyntheticSource, room_frames: list[Frame]) -> Played:
 # Accuracy. Measured: ATE 0.2 cm in each, PSNR before the final pass 35.5 (blank) and 33 dB (loop), after it 32.5 (room)
 
 
-@pytest.mark.parametrize(("scene", "frames", "psnr_db"), [("blank", 720, 34.5), ("loop", 420, 32.0)])
+@pytest.mark.parametrize(
+    ("scene", "frames", "psnr_db"), [("blank", 720, 34.5), pytest.param("loop", 420, 32.0, marks=pytest.mark.long)]
+)
 def test_built_in_scenes(scene: str, frames: int, psnr_db: float) -> None:
     source = built_in(scene, frames)
     played = play(source, read(source, range(50)))
@@ -286,7 +288,7 @@ def test_a_camera_that_is_carried_is_found_where_it_has_been(room: SyntheticSour
     assert np.linalg.norm((found - true_T_wc)[:, :3, 3], axis=1).max() < 0.01
 
 
-@pytest.mark.parametrize("times", ["stretched", "squeezed"])
+@pytest.mark.parametrize("times", ["stretched", pytest.param("squeezed", marks=pytest.mark.long)])
 def test_a_fast_camera_is_followed_whatever_its_times_say(times: str) -> None:
     """Every 24th frame: 15 cm and 12 degrees from one to the next, in what is said to be 0.2 s or 8 ms."""
     source = SyntheticSource(SyntheticConfig(scene="room", frames=720, width=320, height=240), seed=0)
