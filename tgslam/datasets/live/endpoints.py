@@ -15,7 +15,7 @@ from typing import BinaryIO
 
 from tgslam.config.input_settings import DatasetConfig
 from tgslam.datasets.live.live_source import LiveSource
-from tgslam.datasets.live.sent_frame import Announcement, Feed, SentFrame
+from tgslam.datasets.live.sent_frame import Feed
 from tgslam.datasets.live.stream_format import StreamReader
 from tgslam.errors import ConfigError, DatasetError
 
@@ -79,27 +79,6 @@ def loopback(text: str) -> tuple[str, int]:
     return host, port
 
 
-class _StreamFeed:
-    """Frames from a stream of bytes; see `Feed`."""
-
-    def __init__(self, reader: StreamReader, connection: socket.socket | None) -> None:
-        self._reader, self._connection = reader, connection
-
-    @property
-    def announcement(self) -> Announcement:
-        return self._reader.header.announcement
-
-    def next(self) -> SentFrame | None:
-        return self._reader.next()
-
-    def close(self) -> None:
-        """Standard input stays open: a thread that still waits there ends with the process."""
-        if self._connection is not None:
-            with contextlib.suppress(OSError):  # the other side may have gone
-                self._connection.shutdown(socket.SHUT_RDWR)
-            self._connection.close()
-
-
 def _open_feed(text: str) -> Feed:
     if text.startswith(_REALSENSE):
         from tgslam.datasets.live.realsense import RealSenseFeed  # which most users do not have
@@ -111,12 +90,13 @@ def _open_feed(text: str) -> Feed:
 def _standard_input() -> Feed:
     if sys.stdin is None or sys.stdin.isatty():
         raise ConfigError("--input -: standard input is a terminal; pipe a stream of frames into it")
-    file = open(os.dup(sys.stdin.fileno()), "rb", buffering=0)  # noqa: PTH123, SIM115  lasts as long as its thread
+    # A file of its own, which stays open: a thread that still waits there ends with the process
+    file = open(os.dup(sys.stdin.fileno()), "rb", buffering=0)  # noqa: PTH123, SIM115
 
     def receive(view: memoryview) -> int:
         return file.readinto(view) or 0
 
-    return _StreamFeed(StreamReader(receive, "standard input"), None)
+    return StreamReader(receive, "standard input")
 
 
 def _listen(text: str) -> Feed:
@@ -128,10 +108,16 @@ def _listen(text: str) -> Feed:
             connection, _ = server.accept()
     except OSError as cause:
         raise DatasetError(f"{text}: cannot listen there ({cause.strerror or cause}); choose another port") from cause
-    try:
-        return _StreamFeed(StreamReader(connection.recv_into, text), connection)
-    except BaseException:
+
+    def hang_up() -> None:
+        with contextlib.suppress(OSError):  # the other side may have gone
+            connection.shutdown(socket.SHUT_RDWR)
         connection.close()
+
+    try:
+        return StreamReader(connection.recv_into, text, hang_up)
+    except BaseException:
+        hang_up()
         raise
 
 

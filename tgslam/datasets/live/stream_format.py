@@ -58,9 +58,9 @@ class Header:
 class StreamReader:
     """Frames out of bytes, each checked against the header. What is too long or out of step ends the stream."""
 
-    def __init__(self, receive: Receive, where: str) -> None:
+    def __init__(self, receive: Receive, where: str, on_close: Callable[[], None] = lambda: None) -> None:
         """Reads the header. Raises DatasetError for one that says nothing usable. where: for messages."""
-        self._receive, self._where = receive, where
+        self._receive, self._where, self._on_close = receive, where, on_close
         self.header = parse_header(self._first_line(), where)
         told = self.header.announcement
         self._most = (
@@ -68,6 +68,15 @@ class StreamReader:
             _most_bytes(told.depth_size, _DEPTHS.get(self.header.depth)),
         )
         self._count = 0
+
+    @property
+    def announcement(self) -> Announcement:
+        """See `Feed.announcement`."""
+        return self.header.announcement
+
+    def close(self) -> None:
+        """See `Feed.close`."""
+        self._on_close()
 
     def next(self) -> SentFrame | None:
         """See `Feed.next`."""
