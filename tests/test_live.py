@@ -236,10 +236,21 @@ def test_the_oldest_are_dropped_and_counted() -> None:
 
 
 def test_a_run_that_is_slow_gets_the_latest_frames(caplog: pytest.LogCaptureFixture) -> None:
-    source = live(line(lossless=False) + b"".join(raw_frame(0.1 * k, k) for k in range(10)))
+    begun = io.BytesIO(line(lossless=False) + raw_frame(0.0))
+    more = io.BytesIO(b"".join(raw_frame(0.1 * k, k) for k in range(1, 10)))
+    first_is_taken = threading.Event()
+
+    def receive(view: memoryview) -> int:
+        got = begun.readinto(view)
+        if not got:
+            assert first_is_taken.wait(5.0)
+        return got or more.readinto(view)
+
+    source = LiveSource(StreamReader(receive, "pipe"), DatasetConfig())
     caplog.set_level(logging.INFO)
     frames = source.frames()
     first = next(frames)
+    first_is_taken.set()
     for thread in threading.enumerate():
         if thread.name == "live-frames":
             thread.join(5.0)
