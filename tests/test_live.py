@@ -24,9 +24,8 @@ from hypothesis import strategies as st
 
 from tests.fakes import CAMERA, FakeSource, FakeSystem, make_fake_show
 from tgslam.cli import engine, inputs, main
-from tgslam.config.input_settings import DatasetConfig, SyntheticConfig
+from tgslam.config.input_settings import DatasetConfig
 from tgslam.conversion.playing import play
-from tgslam.datasets import open_source
 from tgslam.datasets.calibration import Calibration
 from tgslam.datasets.live.endpoints import is_live, loopback
 from tgslam.datasets.live.latest_frames import KEPT, LatestFrames
@@ -79,21 +78,6 @@ def raw_frame(time_s: float, seed: int = 0) -> bytes:
 
 def png(image: np.ndarray, kind: str = ".png") -> bytes:
     return cv2.imencode(kind, image)[1].tobytes()
-
-
-def test_the_built_in_room_as_a_stream_is_the_same() -> None:
-    config = SyntheticConfig(frames=4, width=32, height=24, noise=False)
-    source = open_source(DatasetConfig(format="synthetic"), config, 0, None)
-    back = live(played(source))
-    assert (back.name, back.camera) == (source.name, source.camera)
-    frames = list(back.frames())
-    assert len(frames) == 4
-    for k, frame in enumerate(frames):
-        expected = source.read(k)
-        assert isinstance(frame, Frame)
-        assert (frame.index, frame.timestamp_s) == (k, expected.timestamp_s)
-        np.testing.assert_allclose(frame.colour, expected.colour, atol=0.501 / 255)
-        np.testing.assert_array_equal(frame.depth_m, expected.depth_m)
 
 
 def test_eight_bit_colour_and_depth_come_back_to_the_bit() -> None:
