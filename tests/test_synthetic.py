@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,9 +14,12 @@ from tests.reference import raycast as reference
 from tgslam.camera import Camera
 from tgslam.config.input_settings import DatasetConfig, SyntheticConfig
 from tgslam.config.loader import load
+from tgslam.conversion.playing import play
 from tgslam.datasets import open_source
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.datasets.detection import told_format
+from tgslam.datasets.live.live_source import LiveSource
+from tgslam.datasets.live.stream_format import StreamReader
 from tgslam.errors import ConfigError
 from tgslam.geometry import inverse, matrix_from_quat_wxyz, se3_log, transform_points
 from tgslam.kernels import procedural
@@ -291,3 +295,18 @@ def test_export_writes_a_tum_folder(tmp_path: Path, capsys):
     assert "not an empty folder" in capsys.readouterr().err
     assert export_synthetic.main([str(tmp_path / "none"), "--frames", "0"]) == ConfigError.exit_code
     assert "synthetic.frames" in capsys.readouterr().err and not (tmp_path / "none").exists()
+
+
+def test_a_scene_played_as_a_stream_is_the_same():
+    one, sent = source(frames=4, width=32, height=24), io.BytesIO()
+    assert play(one, sent) == 4
+    sent.seek(0)
+    back = LiveSource(StreamReader(sent.readinto, "stream"), DatasetConfig())
+    assert (back.name, back.camera) == (one.name, one.camera)
+    frames = list(back.frames())
+    assert len(frames) == 4
+    for k, frame in enumerate(frames):
+        expected = one.read(k)
+        assert (frame.index, frame.timestamp_s) == (k, expected.timestamp_s)
+        np.testing.assert_allclose(frame.colour, expected.colour, atol=0.501 / 255)  # 8 bits
+        np.testing.assert_array_equal(frame.depth_m, expected.depth_m)

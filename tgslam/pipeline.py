@@ -6,10 +6,11 @@ import contextlib
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+from tgslam.datasets.live.live_source import LiveSource
 from tgslam.datasets.read_ahead import read_frames
 from tgslam.datasets.source import RgbdSource
 from tgslam.errors import FrameError, TrackingError
@@ -62,7 +63,7 @@ class Summary:
 
 
 def run(
-    source: RgbdSource,
+    source: RgbdSource | LiveSource,
     system: System,
     folder: RunFolder,
     *,
@@ -78,8 +79,9 @@ def run(
     read_ahead: decode the next frame in a thread meanwhile; only for a source that does not use the kernels itself.
     refine: call `finish`; never done after a request to stop.
     stop_requested: asked before each frame; when true, the run ends there and writes what it has.
-    Raises TrackingError when no frame at all could be tracked. When anything is raised, there is no map.ply, but the
-    poses and the map up to there are kept as partial_trajectory.txt and partial_map.ply where that is possible.
+    Raises TrackingError when no frame at all could be tracked, and DatasetError when a live source gives none. When
+    anything is raised, there is no map.ply, but the poses and the map up to there are kept as partial_trajectory.txt
+    and partial_map.ply where that is possible.
     """
     try:
         summary = _frame_loop(source, system, folder, poses or _NoPoses(), read_ahead, observer, stop_requested)
@@ -96,7 +98,7 @@ def run(
 
 
 def _frame_loop(
-    source: RgbdSource,
+    source: RgbdSource | LiveSource,
     system: System,
     folder: RunFolder,
     poses: Poses,
@@ -105,21 +107,37 @@ def _frame_loop(
     stop_requested: Callable[[], bool],
 ) -> Summary:
     reports: list[FrameReport] = []
-    read_s, interrupted = 0.0, False
+    read_s = 0.0
     start_s = waiting_since_s = time.perf_counter()
     with FrameLog(folder.log) as log:
-        for position, item in enumerate(read_frames(source, read_ahead)):
+        for position, item in enumerate(_frames(source, read_ahead, stop_requested)):
             read_s += time.perf_counter() - waiting_since_s
             if stop_requested():
                 interrupted = True
                 break
-            reports.append(_report(position, item, system, poses, gaussians=reports[-1].gaussians if reports else 0))
+            report = _report(position, item, system, poses, gaussians=reports[-1].gaussians if reports else 0)
+            reports.append(_with_dropped(report, source))
             log.append(reports[-1])
             observer(reports[-1])
             _warn(reports)
             waiting_since_s = time.perf_counter()
+        else:
+            interrupted = isinstance(source, LiveSource) and stop_requested()  # as it waited for a frame
     loop_s = time.perf_counter() - start_s
     return Summary(reports, loop_s=loop_s, finish_s=0.0, read_s=read_s, interrupted=interrupted)
+
+
+def _frames(
+    source: RgbdSource | LiveSource, read_ahead: bool, stop_requested: Callable[[], bool]
+) -> Iterator[Frame | FrameError]:
+    return source.frames(stop_requested) if isinstance(source, LiveSource) else read_frames(source, read_ahead)
+
+
+def _with_dropped(report: FrameReport, source: RgbdSource | LiveSource) -> FrameReport:
+    """Of a live source the log also says how many frames have been dropped so far."""
+    if not isinstance(source, LiveSource):
+        return report
+    return replace(report, measures={**report.measures, "dropped": float(source.dropped)})
 
 
 def _report(position: int, item: Frame | FrameError, system: System, poses: Poses, gaussians: int) -> FrameReport:

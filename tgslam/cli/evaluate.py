@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tgslam.cli import engine
-from tgslam.cli.inputs import can_read_ahead, groundtruth_to_compare, open_frames
+from tgslam.cli.inputs import can_read_ahead, groundtruth_to_compare, open_again
 from tgslam.cli.summary import print_metrics
 from tgslam.config.schema import Config
 from tgslam.datasets.groundtruth import read_groundtruth
@@ -70,7 +70,7 @@ def _groundtruth(file: Path | None, config: Config, source: RgbdSource | None) -
 def _open_source(config: Config, record: RunRecord, required: bool) -> RgbdSource | None:
     """The input of the run; None when it is gone and not required."""
     try:
-        return open_frames(config, None if record.input is None else Path(record.input), record.frames)
+        return open_again(config, record)
     except TgslamError as error:
         if required:
             raise

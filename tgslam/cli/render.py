@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from tgslam.cli import engine
-from tgslam.cli.inputs import open_frames
+from tgslam.cli.inputs import open_again
 from tgslam.errors import OutputError
 from tgslam.evaluation.held_out import Show
 from tgslam.geometry import inverse, se3_exp, transform_points
@@ -128,7 +128,7 @@ def _keyframe_image(folder: RunFolder, number: int) -> Frame:
     positions = [position for position, report in enumerate(read_log(folder.log)) if report.is_keyframe]
     if number >= len(positions):
         raise OutputError(f"{folder.log}: names {len(positions)} keyframes, fewer than {folder.keyframes.name}")
-    source = open_frames(folder.read_config(), None if record.input is None else Path(record.input), record.frames)
+    source = open_again(folder.read_config(), record)
     return source.read(positions[number])
 
 

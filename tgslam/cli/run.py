@@ -13,11 +13,13 @@ from typing import Any
 from tgslam import __version__, pipeline
 from tgslam.cli import engine
 from tgslam.cli.inputs import (
+    Frames,
     add_input_options,
     can_read_ahead,
     groundtruth_to_compare,
+    input_as_recorded,
     known_poses,
-    open_frames,
+    opened,
     parse_frames,
     resolve_config,
     settings_of,
@@ -27,6 +29,7 @@ from tgslam.cli.options import natural
 from tgslam.cli.summary import print_metrics
 from tgslam.config.schema import Config
 from tgslam.datasets.edge_alignment import warn_of_misalignment
+from tgslam.datasets.live.live_source import LiveSource
 from tgslam.datasets.source import RgbdSource
 from tgslam.errors import TgslamError
 from tgslam.evaluation.run_metrics import complete, evaluate_run, peak_rss_mb
@@ -48,7 +51,7 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
         description="Track the camera through an RGB-D sequence and build its Gaussian map. "
         "Ctrl-C ends the run after the current frame and saves everything so far.",
     )
-    add_input_options(parser)
+    add_input_options(parser, live=True)
     parser.add_argument("--output", type=Path, metavar="DIR", help="run folder (default: a new one under runs/)")
     parser.add_argument(
         "--poses",
@@ -83,17 +86,36 @@ def execute(args: argparse.Namespace) -> int:
     config = _with_poses(config, args.poses, args.poses_use)
     frames = parse_frames(args.frames)
     device = engine.start_device(args.device, args.threads)
-    source = open_frames(config, args.input, frames)
+    with opened(config, args.input, frames) as source:
+        metrics, folder = _recorded(args, config, source, frames)
+    metrics |= {"device": device, "seed": config.seed}
+    metrics |= {"wall_s": time.perf_counter() - started_s, "peak_rss_mb": peak_rss_mb()}
+    folder.write_metrics(complete(metrics))
+    folder.write_record(dataclasses.replace(folder.read_record(), state=RunState(metrics["state"])))
+    print_metrics(f"{source.name} -> {folder.path}", complete(metrics))
+    if metrics["state"] == RunState.INTERRUPTED.value:
+        again = _readable_again(source)
+        of_all = "" if again is None else f" of {len(again)}"
+        _log.warning("stopped after %d%s frames; all of them are saved", metrics["frames"], of_all)
+        return _EXIT_INTERRUPTED
+    return 0
+
+
+def _recorded(
+    args: argparse.Namespace, config: Config, source: RgbdSource | LiveSource, frames: Frames
+) -> tuple[dict[str, Any], RunFolder]:
+    """Do the run in a folder of its own; run.json says when it failed."""
     poses = known_poses(config, source)
-    if config.dataset.format != "synthetic":  # whose depth lies where colour does
-        warn_of_misalignment(source)
+    again = _readable_again(source)
+    if again is not None and config.dataset.format != "synthetic":  # whose depth lies where colour does
+        warn_of_misalignment(again)
     path = args.output or fresh_folder(Path("runs"), source.name, datetime.now())
     folder = RunFolder.create(path, args.overwrite)
     record = RunRecord(
         tgslam=__version__,
         state=RunState.RUNNING,
         source=source.name,
-        input=None if args.input is None else str(args.input.resolve()),
+        input=input_as_recorded(args.input),
         frames=frames,
         camera=source.camera,
     )
@@ -101,38 +123,30 @@ def execute(args: argparse.Namespace) -> int:
     folder.write_config(config)
     try:
         with StopRequest() as stop:
-            metrics = _run_and_evaluate(args, config, source, poses, folder, stop)
+            return _run_and_evaluate(args, config, source, poses, folder, stop), folder
     except BaseException as error:
         _mark_failed(folder, record, error)
         raise
-    metrics |= {"device": device, "seed": config.seed}
-    metrics |= {"wall_s": time.perf_counter() - started_s, "peak_rss_mb": peak_rss_mb()}
-    folder.write_metrics(complete(metrics))
-    folder.write_record(dataclasses.replace(record, state=RunState(metrics["state"])))
-    print_metrics(f"{source.name} -> {folder.path}", complete(metrics))
-    if metrics["state"] == RunState.INTERRUPTED.value:
-        _log.warning("stopped after %d of %d frames; all of them are saved", metrics["frames"], len(source))
-        return _EXIT_INTERRUPTED
-    return 0
 
 
 def _run_and_evaluate(
     args: argparse.Namespace,
     config: Config,
-    source: RgbdSource,
+    source: RgbdSource | LiveSource,
     poses: pipeline.Poses | None,
     folder: RunFolder,
     stop: StopRequest,
 ) -> dict[str, Any]:
     """The metrics of the run, from the files that it wrote; images are left out once the user asked to stop."""
     system = engine.make_system(source.camera, config)
-    with frame_progress(len(source), error_console(), args.quiet) as observer:
+    again = _readable_again(source)
+    with frame_progress(None if again is None else len(again), error_console(), args.quiet) as observer:
         summary = pipeline.run(
             source,
             system,
             folder,
             poses=poses,
-            read_ahead=can_read_ahead(source),
+            read_ahead=can_read_ahead(again),
             refine=not args.no_final,
             observer=observer,
             stop_requested=stop,
@@ -141,12 +155,14 @@ def _run_and_evaluate(
     metrics = evaluate_run(
         folder,
         config.evaluation,
-        source,
+        again,
         _groundtruth(config, source),
         None if stop() else lambda gaussians, planes: engine.make_show(source.camera, gaussians, planes, config),
-        read_ahead=can_read_ahead(source),
+        read_ahead=can_read_ahead(again),
         stop_requested=stop,
     )
+    if again is None:
+        _log.warning("the image metrics are null: frames that came live cannot be read again")
     metrics["stage_s"] |= {
         "read": summary.read_s,
         "finish": summary.finish_s,
@@ -157,6 +173,11 @@ def _run_and_evaluate(
     return metrics
 
 
+def _readable_again(source: RgbdSource | LiveSource) -> RgbdSource | None:
+    """The source, if its frames can be counted before the run and compared after it."""
+    return None if isinstance(source, LiveSource) else source
+
+
 def _with_poses(config: Config, file: str | None, use: str | None) -> Config:
     """The settings with what `--poses` and `--poses-use` say."""
     poses = config.poses if file is None else dataclasses.replace(config.poses, file=file)
@@ -165,7 +186,7 @@ def _with_poses(config: Config, file: str | None, use: str | None) -> Config:
     return dataclasses.replace(config, poses=poses)
 
 
-def _groundtruth(config: Config, source: RgbdSource) -> Trajectory | None:
+def _groundtruth(config: Config, source: RgbdSource | LiveSource) -> Trajectory | None:
     """The ground truth, opened only now that tracking is over; the run stands without it."""
     try:
         return groundtruth_to_compare(config, source)

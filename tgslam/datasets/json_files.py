@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from tgslam.errors import DatasetError
 
 _MOST_BYTES = 1 << 29
+_LARGEST = 1e300  # whole numbers of JSON may be larger than any float
 
 
 def read_object(path: Path) -> dict[str, Any]:
@@ -41,7 +41,7 @@ def parse_object(data: bytes, name: str) -> dict[str, Any]:
 def number(mapping: Mapping[str, Any], key: str, name: str, default: float | None = None) -> float:
     """A finite number of a JSON object. Raises DatasetError without one and a default."""
     value = mapping.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _LARGEST:
         raise DatasetError(f"{name}: expected a number as {key!r}, found {_short(value)}")
     return float(value)
 
@@ -50,7 +50,7 @@ def numbers(mapping: Mapping[str, Any], key: str, name: str, shape: tuple[int, .
     """An array of a JSON object; its count of numbers is that of `shape`, -1 = any. They need not be finite."""
     try:
         return np.asarray(mapping[key], np.float64).reshape(shape)
-    except (KeyError, TypeError, ValueError) as cause:
+    except (KeyError, OverflowError, TypeError, ValueError) as cause:
         sizes = "x".join("N" if side < 0 else str(side) for side in shape)
         raise DatasetError(f"{name}: expected {sizes} numbers as {key!r}, found {_short(mapping.get(key))}") from cause
 

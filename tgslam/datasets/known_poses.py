@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tgslam.datasets.groundtruth import read_groundtruth
+from tgslam.datasets.live.live_source import LiveSource
 from tgslam.datasets.source import RgbdSource
 from tgslam.errors import DatasetError
 from tgslam.files.pose_text import read_pose_table
@@ -53,7 +54,7 @@ class PosesByFrame:
         return self._T_wc[index] if index < len(self._T_wc) and self._usable[index] else None
 
 
-def open_poses(where: str, source: RgbdSource) -> KnownPoses | PosesByFrame:
+def open_poses(where: str, source: RgbdSource | LiveSource) -> KnownPoses | PosesByFrame:
     """The poses in a file, or with `OF_THE_RECORDING` those that came with the frames of `source`.
 
     Raises DatasetError when there are none, or when they cannot be read.

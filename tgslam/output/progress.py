@@ -29,7 +29,7 @@ class FrameObserver(Protocol):
 class _Counts:
     """Frames, keyframes and Gaussians so far, and the frames per second."""
 
-    def __init__(self, total: int) -> None:
+    def __init__(self, total: int | None) -> None:
         self.total, self.frames, self.keyframes, self.gaussians = total, 0, 0, 0
         self._start_s = time.monotonic()
 
@@ -47,8 +47,8 @@ class _Counts:
 
 
 @contextmanager
-def frame_progress(total: int, console: Console, quiet: bool) -> Iterator[FrameObserver]:
-    """An observer of the `total` frames to come, for as long as the block lasts."""
+def frame_progress(total: int | None, console: Console, quiet: bool) -> Iterator[FrameObserver]:
+    """An observer of the `total` frames to come, None = not known, for as long as the block lasts."""
     if quiet:
         yield lambda report: None
     elif console.is_terminal:
@@ -70,7 +70,7 @@ def _bar(console: Console) -> Progress:
 
 
 class _BarObserver:
-    def __init__(self, bar: Progress, total: int) -> None:
+    def __init__(self, bar: Progress, total: int | None) -> None:
         self._bar, self._counts = bar, _Counts(total)
         self._task = bar.add_task("frames", total=total, counts="")
 
@@ -80,9 +80,12 @@ class _BarObserver:
 
 
 class _Pace:
-    """A line after every tenth of the work or ten seconds, whichever comes later; and one at the end."""
+    """A line after every tenth of the work or ten seconds, whichever comes later; and one at the end.
 
-    def __init__(self, total: int) -> None:
+    Where the total is not known, every ten seconds.
+    """
+
+    def __init__(self, total: int | None) -> None:
         self._total = total
         self._take_note(0)
 
@@ -94,18 +97,19 @@ class _Pace:
         return late or done == self._total
 
     def _take_note(self, done: int) -> None:
-        self._next = done + _LINE_FRACTION * self._total
+        self._next = done + _LINE_FRACTION * (self._total or 0)
         self._next_s = time.monotonic() + _LINE_INTERVAL_S
 
 
 class _LineObserver:
-    def __init__(self, total: int) -> None:
+    def __init__(self, total: int | None) -> None:
         self._counts, self._pace = _Counts(total), _Pace(total)
 
     def __call__(self, report: FrameReport) -> None:
         self._counts.add(report)
         if self._pace.due(self._counts.frames):
-            _log.info("frame %d of %d: %s", self._counts.frames, self._counts.total, self._counts)
+            of_all = "" if self._counts.total is None else f" of {self._counts.total}"
+            _log.info("frame %d%s: %s", self._counts.frames, of_all, self._counts)
 
 
 @contextmanager
