@@ -444,6 +444,10 @@ def test_nothing_is_overwritten_without_being_asked(run: RunFolder, capsys: pyte
     assert "colmap is a folder" in refused(capsys, run, "--to", "colmap", "--output", str(mine), "--overwrite")
     assert "ply is a file" in refused(capsys, run, "--to", "ply", "--output", str(run.path), "--overwrite")
     assert mine.read_text() == "mine"
+    before = run.map.read_bytes()
+    own = ["--output", str(run.path / "exports" / ".." / "map.ply"), "--level", "--overwrite"]
+    assert "the run's own" in refused(capsys, run, "--to", "ply", *own)
+    assert run.map.read_bytes() == before
     assert {path.name for path in (run.path / "exports").iterdir()} == {"map.spz", "colmap"}
 
 

@@ -39,6 +39,9 @@ def write_export(name: str, content: RunContent, path: Path, overwrite: bool) ->
     Raises OutputError for what is in the way and for what the run lacks, and OSError.
     """
     chosen = FORMATS[name]
+    own = content.folder
+    if path.resolve() in {(own.path / file).resolve() for file in (own.RECORD, *own.RESULTS)}:
+        raise OutputError(f"{path}: is the run's own, which an export never replaces; choose another --output")
     if path.is_dir() != chosen.is_folder and path.exists():
         raise OutputError(f"{path}: {name} is a {'folder' if chosen.is_folder else 'file'}; choose another --output")
     if path.exists() and not overwrite and not (chosen.is_folder and not any(path.iterdir())):
