@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import logging
+import shutil
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +14,6 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from evo.tools import file_interface
 from plyfile import PlyData
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -98,14 +98,21 @@ def make_run(path: Path, found: FakeSystem | None = None) -> RunFolder:
     return folder
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that is made once, and copied for each test."""
+    return make_run(tmp_path_factory.mktemp("made") / "run").path
+
+
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunFolder]:
+def run(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunFolder]:
     """A run in a folder of a name that is not ASCII, and the input that it was made from."""
     monkeypatch.setattr(inputs, "open_source", lambda *args: FakeSource(FRAMES))
     monkeypatch.setattr(engine, "start_device", lambda name, threads=0: "cpu")
     logger = logging.getLogger("tgslam")
     before = list(logger.handlers), logger.level, logger.propagate
-    yield make_run(tmp_path / "Küche 1")
+    shutil.copytree(made, tmp_path / "Küche 1")
+    yield RunFolder(tmp_path / "Küche 1")
     logger.handlers[:], logger.level, logger.propagate = before
 
 
@@ -404,6 +411,8 @@ def test_a_cloud_is_thinned_the_same_each_time() -> None:
 
 
 def test_evo_reads_the_poses(run: RunFolder) -> None:
+    from evo.tools import file_interface  # slow to import, and one test needs it
+
     truth = np.stack([true_pose(index) for index in range(FRAMES)])
     tum = file_interface.read_tum_trajectory_file(str(export(run, "tum")))
     np.testing.assert_allclose(np.stack(tum.poses_se3), truth, atol=1e-8)
