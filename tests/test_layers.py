@@ -24,7 +24,7 @@ RANKS = (
     {"boundary", "graph", "keyframing", "mapping", "preparation", "sensing", "tracking"},
     {"assembly", "datasets", "record", "slam"},
     {"adaptation", "evaluation", "output", "recording"},
-    {"conversion", "inspection", "pipeline", "saving"},
+    {"conversion", "exports", "inspection", "pipeline", "saving"},
     {"bench"},
     {"cli"},
     {"__main__"},

@@ -1,4 +1,4 @@
-"""`tgslam render`: a run's map seen along a trajectory, from its keyframes, or on a swing; or one picture of it all."""
+"""`tgslam render`: a map seen along a trajectory, from a run's keyframes, or on a swing; or one picture of it all."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 
 from tgslam.cli import engine
+from tgslam.cli.bare_map import add_camera_options, bare_camera, first_look, require_a_run
 from tgslam.cli.inputs import open_again
+from tgslam.config.schema import Config
 from tgslam.errors import OutputError
 from tgslam.evaluation.held_out import Show
 from tgslam.geometry import inverse, se3_exp, transform_points
@@ -28,6 +30,7 @@ _log = logging.getLogger(__name__)
 _ORBIT_YAW_RAD = np.deg2rad(20.0)
 _ORBIT_PITCH_RAD = np.deg2rad(8.0)
 _ORBIT_FPS = 30.0
+_MODES = ("orbit", "planes", "overview", "keyframes")  # besides a trajectory
 _FAR_PERCENTILE = 95.0  # of the distances to the map's Gaussians: the blue end of depth colours
 
 
@@ -35,35 +38,40 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
     """Add the command to the subparsers `commands`."""
     parser: argparse.ArgumentParser = commands.add_parser(
         "render",
-        help="render images of a run's map",
+        help="render images of a run's map, or of any 3DGS PLY",
         description="Write colour/, depth/ (16-bit PNG, 5000 units a metre, 0 = none) and depth_colours/, "
         "one PNG a pose, and the poses themselves in poses.txt; with --planes, planes/ instead of those; "
         "with --overview, overview.png.",
     )
-    parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
-    what = parser.add_mutually_exclusive_group(required=True)
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder; or a 3DGS PLY (default: --orbit)")
+    what = parser.add_mutually_exclusive_group()
     what.add_argument("--trajectory", type=Path, metavar="FILE", help="camera-to-world poses as TUM text")
     what.add_argument("--keyframes", action="store_true", help="the run's keyframes")
     what.add_argument("--planes", action="store_true", help="the run's keyframes with the planes that the map shows")
     what.add_argument("--overview", action="store_true", help="one picture: input, rendering, planes and floor plan")
     what.add_argument("--orbit", action="store_true", help="a closed swing round what the first keyframe looks at")
     parser.add_argument("--count", type=_positive, default=60, metavar="N", help="poses of --orbit (default: 60)")
-    parser.add_argument("--output", type=Path, metavar="DIR", help="folder (default: RUN/render-...)")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="folder (default: RUN/render-...; PLY-render-...)")
     parser.add_argument("--overwrite", action="store_true", help="write into a folder that is not empty")
+    add_camera_options(parser)
     engine.add_device_option(parser)
+    parser.set_defaults(refuse=parser.error)
     return parser
 
 
 def execute(args: argparse.Namespace) -> int:
     """Render every pose."""
+    if args.run.is_file():
+        return _render_ply(args)
+    if args.trajectory is None and not any(getattr(args, mode) for mode in _MODES):
+        args.refuse(f"one of the arguments --trajectory {' '.join(f'--{mode}' for mode in _MODES)} is required")
     folder = RunFolder.open(args.run)
+    require_a_run(args)
     camera = folder.read_record().camera
     gaussians = read_map(folder.map)
     planes = _planes(folder) if args.planes or args.overview else ()
     name, poses = _poses(args, folder, gaussians)
-    output = args.output or folder.path / f"render-{name}"
-    if output.exists() and (not output.is_dir() or any(output.iterdir())) and not args.overwrite:
-        raise OutputError(f"{output}: is there already; choose another --output, or add --overwrite")
+    output = _output(args, folder.path / f"render-{name}")
     engine.start_device(args.device)
     show = engine.make_show(camera, gaussians, planes, folder.read_config())
     if args.overview:
@@ -72,6 +80,31 @@ def execute(args: argparse.Namespace) -> int:
         _write_plane_images(output, poses, show, planes)
     else:
         _write_map_images(output, gaussians, poses, show)
+    return _finish(output, poses)
+
+
+def _render_ply(args: argparse.Namespace) -> int:
+    """Render a PLY that comes without a run."""
+    camera, gaussians = bare_camera(args), read_map(args.run)
+    if args.trajectory is not None:
+        name, poses = args.trajectory.stem, _stored_poses(args.trajectory)
+    else:
+        name, poses = "orbit", orbit(gaussians, first_look(gaussians, camera), args.count)
+    output = _output(args, args.run.with_name(f"{args.run.stem}-render-{name}"))
+    engine.start_device(args.device)
+    _write_map_images(output, gaussians, poses, engine.make_show(camera, gaussians, (), Config()))
+    return _finish(output, poses)
+
+
+def _output(args: argparse.Namespace, default: Path) -> Path:
+    """The folder to write. Raises OutputError when it holds something."""
+    output: Path = args.output or default
+    if output.exists() and (not output.is_dir() or any(output.iterdir())) and not args.overwrite:
+        raise OutputError(f"{output}: is there already; choose another --output, or add --overwrite")
+    return output
+
+
+def _finish(output: Path, poses: Trajectory) -> int:
     write_trajectory(output / "poses.txt", poses)
     _log.info("%d image%s of each kind %s in %s", len(poses), *(("s", "are") if len(poses) > 1 else ("", "is")), output)
     return 0
@@ -139,7 +172,7 @@ def orbit(gaussians: Gaussians, T_wc: Matrix4, count: int) -> Trajectory:
     """
     depths_m = transform_points(inverse(T_wc), gaussians.mean)[:, 2]
     if not (depths_m > 0).any():
-        raise OutputError("no Gaussian lies in front of the first keyframe, so there is nothing to orbit")
+        raise OutputError("no Gaussian lies in front of the first camera, so there is nothing to orbit")
     to_pivot = np.eye(4)
     to_pivot[2, 3] = np.median(depths_m[depths_m > 0])
     phases = 2.0 * np.pi * np.arange(count) / count
@@ -156,12 +189,16 @@ def _poses(args: argparse.Namespace, folder: RunFolder, gaussians: Gaussians) ->
     if args.trajectory is not None:
         name, path = args.trajectory.stem, args.trajectory
     else:
-        modes = ("orbit", "planes", "overview", "keyframes")
-        name, path = next(mode for mode in modes if getattr(args, mode)), folder.keyframes
+        name, path = next(mode for mode in _MODES if getattr(args, mode)), folder.keyframes
+    poses = _stored_poses(path)
+    return name, orbit(gaussians, poses.T_wc[0], args.count) if args.orbit else poses
+
+
+def _stored_poses(path: Path) -> Trajectory:
     poses = read_trajectory(path)
     if not len(poses):
         raise OutputError(f"{path}: holds no pose")
-    return name, orbit(gaussians, poses.T_wc[0], args.count) if args.orbit else poses
+    return poses
 
 
 def _planes(folder: RunFolder) -> tuple[Plane, ...]:

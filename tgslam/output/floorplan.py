@@ -60,7 +60,7 @@ def wall_lines(planes: Sequence[Plane], up_w: Vector) -> list[WallLine]:
     The plan's axes are level: y is the way that the first camera looks (its image's up, should it look along up_w), and
     x is to the right of it as seen from above.
     """
-    axes = _plan_axes(up_w)
+    axes = plan_axes(up_w)
     lines = []
     for plane in planes:
         if abs(float(plane.normal_w @ up_w)) > _UPRIGHT_SINE:
@@ -77,7 +77,7 @@ def wall_lines(planes: Sequence[Plane], up_w: Vector) -> list[WallLine]:
 
 def plan_points(points_w: Vector, up_w: Vector) -> Vector:
     """World points [N, 3] m in the plan's axes [N, 2] m."""
-    return np.asarray(points_w @ _plan_axes(up_w).T)
+    return np.asarray(points_w @ plan_axes(up_w).T)
 
 
 def scale_bar_m(most_m: float) -> float:
@@ -108,7 +108,7 @@ def write_floorplan(path: Path, planes: Sequence[Plane]) -> None:
     write_text(path, ElementTree.tostring(svg, encoding="unicode") + "\n")
 
 
-def _plan_axes(up_w: Vector) -> Vector:
+def plan_axes(up_w: Vector) -> Vector:
     """[2, 3] unit: right and ahead of the first camera, both level."""
     ahead = np.array([0.0, 0.0, 1.0])
     if abs(float(ahead @ up_w)) > 0.9:

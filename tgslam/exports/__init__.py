@@ -1,0 +1,1 @@
+"""What a run has found, written for other programs: one module a format, listed in `export_formats`."""
