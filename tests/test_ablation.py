@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from tests.job_fakes import fake_distributed
 from tgslam.bench.ablation import cases
 from tgslam.bench.ablation import results as table
 from tgslam.bench.ablation.studies import STUDIES, Column, Study, Variant
@@ -227,53 +228,9 @@ def test_there_is_no_such_study(capsys: pytest.CaptureFixture[str]) -> None:
 # A cluster
 
 
-class FakeFuture:
-    def __init__(self, function: Any, *arguments: Any) -> None:
-        self.status = "finished"
-        try:
-            self._result = function(*arguments)
-        except RuntimeError as error:
-            self.status, self._error = "error", error
-
-    def result(self) -> Any:
-        return self._result
-
-    def exception(self) -> Exception:
-        return self._error
-
-
-class FakeClient:
-    """What is used of `distributed.Client`, which does its tasks at once; the third one is lost."""
-
-    def __init__(self, address: str) -> None:
-        if address != "tcp://here:8786":
-            raise OSError("timed out")
-        self.submitted = 0
-
-    def __enter__(self) -> FakeClient:
-        return self
-
-    def __exit__(self, *reason: object) -> None:
-        pass
-
-    def scheduler_info(self) -> dict[str, Any]:
-        return {"workers": {}}
-
-    def submit(self, function: Any, *arguments: Any, pure: bool) -> FakeFuture:
-        assert not pure
-        self.submitted += 1
-
-        def lose(*_: Any) -> None:
-            raise RuntimeError("the worker is gone")
-
-        return FakeFuture(lose if self.submitted == 3 else function, *arguments)
-
-
 @pytest.fixture
 def fake_dask(monkeypatch: pytest.MonkeyPatch) -> None:
-    worker = types.SimpleNamespace(state=types.SimpleNamespace(nthreads=1000))
-    fake = types.SimpleNamespace(Client=FakeClient, as_completed=list, get_worker=lambda: worker)
-    monkeypatch.setitem(sys.modules, "distributed", fake)
+    monkeypatch.setitem(sys.modules, "distributed", fake_distributed(lost=3))
 
 
 @pytest.mark.usefixtures("fake_runs", "fake_dask")

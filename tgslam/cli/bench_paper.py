@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tgslam.bench.ablation.cases import require_effect
-from tgslam.bench.ablation.studies import STUDIES, keys_of
+from tgslam.bench.ablation.studies import keys_of
 from tgslam.bench.paper import side_by_side
 from tgslam.bench.paper.figures import PaperTable, Row, paper_figures
 from tgslam.bench.paper.recordings_found import find_sequences, shortness
@@ -24,6 +23,7 @@ from tgslam.errors import ConfigError, DatasetError
 from tgslam.files.atomic import write_text
 
 _FIGURE = "fig6"
+_NAMES = ("1", "2", "3", "4", "5", _FIGURE)
 _SCENE, _FRAME = "room", 0  # the paper's Fig. 6 shows frame 0
 _ALL = "all"
 
@@ -40,7 +40,7 @@ def add_parser(benchmarks: Any) -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "tables", nargs="*", type=_table, default=[_ALL], metavar="TABLE",
-        help=f"{', '.join(_names())} or all (default: all)",
+        help=f"{', '.join(_NAMES)} or all (default: all)",
     )  # fmt: skip
     parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="folder with sequences, at any depth")
     add_settings_options(parser)
@@ -60,7 +60,7 @@ def _measure(args: argparse.Namespace) -> dict[str, Any]:
     """All that was asked for; whatever is wrong with the arguments is said before anything runs."""
     from tgslam.bench import report
 
-    names = _names() if _ALL in args.tables else args.tables
+    names = _NAMES if _ALL in args.tables else args.tables
     tables = [table for table in paper_figures().tables if table.number in names]
     jobs, marks = _plan(args, tables)
     args.output.mkdir(parents=True, exist_ok=True)
@@ -98,8 +98,7 @@ def _plan(args: argparse.Namespace, tables: Sequence[PaperTable]) -> tuple[dict[
             f"{args.data}: no sequence of these tables is at or below it; they are told by their folders' names, such "
             "as room0 (Replica) or rgbd_dataset_freiburg1_desk (TUM RGB-D), and by their layouts (docs/measuring.md)"
         )
-    there = {table.study for table in tables if any(row.sequence in folders for row in table.rows)}
-    require_effect(overrides, [STUDIES[name] for name in there if name is not None])
+    _require_effect(overrides, [table for table in tables if any(row.sequence in folders for row in table.rows)])
     inputs = {sequence: folder_input(folder, args.config, overrides, frames) for sequence, folder in folders.items()}
     marks = {sequence.name: shortness(sequence, _length_s(input_, frames)) for sequence, input_ in inputs.items()}
     seeds, parent = list(dict.fromkeys(args.seeds)), args.output.resolve() / "runs"
@@ -109,6 +108,14 @@ def _plan(args: argparse.Namespace, tables: Sequence[PaperTable]) -> tuple[dict[
         if row.sequence in inputs
     }
     return jobs, marks
+
+
+def _require_effect(overrides: tuple[str, ...], tables: Sequence[PaperTable]) -> None:
+    """Raise ConfigError for an override of the user that a row of these tables would override itself."""
+    for table in tables:
+        for key in sorted(keys_of(overrides)):
+            if any(key in keys_of(row.overrides) for row in table.rows):
+                raise ConfigError(f"--set {key}: Table {table.number} sets it itself; leave one of the two out")
 
 
 def _job(row: Row, input_: Input, seed: int, frames: Frames, parent: Path) -> Job:
@@ -127,11 +134,7 @@ def _write(output: Path, result: dict[str, Any]) -> None:
     write_text(output / "paper.json", json.dumps(result, indent=2, allow_nan=False) + "\n")
 
 
-def _names() -> tuple[str, ...]:
-    return (*(table.number for table in paper_figures().tables), _FIGURE)
-
-
 def _table(text: str) -> str:
-    if text not in (*_names(), _ALL):
-        raise argparse.ArgumentTypeError(f"there is no table {text!r}; choose from {', '.join(_names())} and all")
+    if text not in (*_NAMES, _ALL):
+        raise argparse.ArgumentTypeError(f"there is no table {text!r}; choose from {', '.join(_NAMES)} and all")
     return text

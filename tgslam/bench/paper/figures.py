@@ -60,7 +60,6 @@ class PaperTable:
     rows: tuple[Row, ...]
     has_average: bool
     measures: tuple[Measure, ...]
-    study: str | None  # of the ablation studies, which sets what its variants say
 
 
 @dataclass(frozen=True)
@@ -86,9 +85,9 @@ def _table(entry: Mapping[str, Any], sequences: Mapping[str, Sequence]) -> Paper
         Measure(_COLUMNS[key], {method: tuple(values) for method, values in printed.items()})
         for key, printed in entry["figures"].items()
     )
-    study = entry.get("study")
-    rows = [row for name in entry["rows"] for row in _rows(sequences[name], study, entry.get("variants", ()))]
-    return PaperTable(entry["number"], entry["title"], tuple(rows), entry["average"], tuple(measures), study)
+    study, variants = entry.get("study"), entry.get("variants", ())
+    rows = [row for name in entry["rows"] for row in _rows(sequences[name], study, variants)]
+    return PaperTable(entry["number"], entry["title"], tuple(rows), entry["average"], tuple(measures))
 
 
 def _rows(sequence: Sequence, study: str | None, names: list[str]) -> list[Row]:
