@@ -42,7 +42,9 @@ def add_parser(benchmarks: Any) -> argparse.ArgumentParser:
         "tables", nargs="*", type=_table, default=[_ALL], metavar="TABLE",
         help=f"{', '.join(_NAMES)} or all (default: all)",
     )  # fmt: skip
-    parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="folder with sequences, at any depth")
+    parser.add_argument(
+        "--data", type=Path, required=True, metavar="DIR", help="folder with sequences, up to five below it"
+    )
     add_settings_options(parser)
     parser.add_argument(
         "--seeds", type=natural, nargs="+", default=[0], metavar="N", help="a run with each (default: 0)"

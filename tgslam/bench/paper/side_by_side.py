@@ -39,7 +39,7 @@ def shown(tables: Sequence[dict[str, Any]]) -> list[tuple[str, list[str], list[l
     return [
         (
             f"Table {table['table']}: {table['title']}, {measure['title']}",
-            [measure["title"], *measure["methods"], HERE, "note"],
+            ["sequence", *measure["methods"], HERE, "note"],
             [_cells(row, measure) for row in measure["rows"]],
         )
         for table in tables
