@@ -174,6 +174,7 @@ def test_tables_of_replica_share_runs_and_are_done_once(tmp_path: Path, monkeypa
     assert row(found, "1", "psnr_db", "R0")["here"]["mean"] == 30.0
     assert row(found, "1", "psnr_db", "R0")["printed"]["paper"] == 36.67
     assert row(found, "1", "lpips", "R0")["here"]["mean"] is None
+    assert row(found, "1", "lpips", "R0")["note"] == "not measured"
     assert row(found, "1", "depth_l1_cm", "R0")["printed"] == {}
     assert [row(found, "4", "ate_rmse_cm", f"R0, every {k}")["here"]["mean"] for k in (4, 10, 25)] == [2.0, 5.0, 12.5]
     average = row(found, "2", "ate_rmse_cm", "Avg")

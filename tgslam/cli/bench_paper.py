@@ -43,7 +43,7 @@ def add_parser(benchmarks: Any) -> argparse.ArgumentParser:
         help=f"{', '.join(_NAMES)} or all (default: all)",
     )  # fmt: skip
     parser.add_argument(
-        "--data", type=Path, required=True, metavar="DIR", help="folder with sequences, up to five below it"
+        "--data", type=Path, required=True, metavar="DIR", help="folder with sequences, up to five folders down"
     )
     add_settings_options(parser)
     parser.add_argument(

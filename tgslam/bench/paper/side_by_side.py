@@ -13,7 +13,7 @@ from tgslam.bench.runs.outcome import NO_VALUE, Failures, Metrics, markdown_grid
 
 HERE = "tgslam"
 _AVERAGE = "Avg"
-_NOT_FOUND = "not found"
+_NOT_FOUND, _NOT_MEASURED = "not found", "not measured"
 
 Jobs = Mapping[Row, Sequence[Job]]  # by seed, of the rows whose sequences are there
 
@@ -101,7 +101,8 @@ def _measure(
 ) -> dict[str, Any]:
     key = measure.column.key
     here = [over_seeds([metrics.get(job.folder, {}).get(key) for job in jobs.get(row, ())]) for row in table.rows]
-    names, notes = [row.name for row in table.rows], [_note(row, jobs, marks, metrics) for row in table.rows]
+    names, holes = [row.name for row in table.rows], [value["mean"] is None for value in here]
+    notes = [_note(row, jobs, marks, metrics, is_hole) for row, is_hole in zip(table.rows, holes, strict=True)]
     if table.has_average:
         means = [value["mean"] for value in here]
         known = [mean for mean in means if mean is not None]
@@ -116,11 +117,11 @@ def _measure(
     return {**vars(measure.column), "methods": list(measure.printed), "rows": rows}
 
 
-def _note(row: Row, jobs: Jobs, marks: Mapping[str, str], metrics: Metrics) -> str:
+def _note(row: Row, jobs: Jobs, marks: Mapping[str, str], metrics: Metrics, is_hole: bool) -> str:
     if row not in jobs:
         return _NOT_FOUND
     finished = sum(job.folder in metrics for job in jobs[row])
-    runs = "" if finished == len(jobs[row]) else f"{finished} of {len(jobs[row])} runs"
+    runs = f"{finished} of {len(jobs[row])} runs" if finished < len(jobs[row]) else _NOT_MEASURED if is_hole else ""
     return "; ".join(filter(None, (marks.get(row.sequence.name, ""), runs)))
 
 
