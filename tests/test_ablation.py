@@ -14,9 +14,11 @@ from typing import Any
 
 import pytest
 
-from tgslam.bench.ablation import jobs, workers
+from tests.job_fakes import fake_distributed
+from tgslam.bench.ablation import cases
 from tgslam.bench.ablation import results as table
 from tgslam.bench.ablation.studies import STUDIES, Column, Study, Variant
+from tgslam.bench.runs import jobs, workers
 from tgslam.cli import main
 from tgslam.config.loader import load
 from tgslam.config.schema import Config
@@ -94,17 +96,17 @@ def test_cases_with_the_same_settings_share_a_run(tmp_path: Path) -> None:
     plan = [
         case
         for study in (STUDIES["gate"], STUDIES["terms"])
-        for case in jobs.plan(study, [ROOM], [0, 1], EVERY_FRAME, tmp_path)
+        for case in cases.plan(study, [ROOM], [0, 1], EVERY_FRAME, tmp_path)
     ]
     assert len(plan) == 2 * (2 + 4)
-    assert len(jobs.jobs_of(plan)) == len(plan) - 2  # gate on is all terms
-    assert jobs.jobs_of(plan)[0].label == "gate on, room, seed 0"
+    assert len(cases.jobs_of(plan)) == len(plan) - 2  # gate on is all terms
+    assert cases.jobs_of(plan)[0].label == "gate on, room, seed 0"
     assert all(case.job.config.seed == case.seed for case in plan)
 
 
 def test_whatever_a_run_depends_on_names_its_folder(tmp_path: Path) -> None:
     def folder(input_: jobs.Input = ROOM, seed: int = 0, frames: jobs.Frames = EVERY_FRAME) -> Path:
-        return jobs.plan(STUDIES["gate"], [input_], [seed], frames, tmp_path)[0].job.folder
+        return cases.plan(STUDIES["gate"], [input_], [seed], frames, tmp_path)[0].job.folder
 
     other = dataclasses.replace(ROOM, config=load(None, ["mapping.iterations=3"]))
     clip = dataclasses.replace(ROOM, folder=tmp_path / "room")
@@ -115,7 +117,7 @@ def test_whatever_a_run_depends_on_names_its_folder(tmp_path: Path) -> None:
 def test_a_variant_with_an_unknown_key_is_an_error(tmp_path: Path) -> None:
     study = Study("s", "", (), (Variant("a", ("loss.gaet=true",)),), (), ())
     with pytest.raises(ConfigError, match=r"unknown key `loss\.gaet`; did you mean `loss\.gate`"):
-        jobs.plan(study, [ROOM], [0], EVERY_FRAME, tmp_path)
+        cases.plan(study, [ROOM], [0], EVERY_FRAME, tmp_path)
 
 
 # Runs
@@ -227,53 +229,9 @@ def test_there_is_no_such_study(capsys: pytest.CaptureFixture[str]) -> None:
 # A cluster
 
 
-class FakeFuture:
-    def __init__(self, function: Any, *arguments: Any) -> None:
-        self.status = "finished"
-        try:
-            self._result = function(*arguments)
-        except RuntimeError as error:
-            self.status, self._error = "error", error
-
-    def result(self) -> Any:
-        return self._result
-
-    def exception(self) -> Exception:
-        return self._error
-
-
-class FakeClient:
-    """What is used of `distributed.Client`, which does its tasks at once; the third one is lost."""
-
-    def __init__(self, address: str) -> None:
-        if address != "tcp://here:8786":
-            raise OSError("timed out")
-        self.submitted = 0
-
-    def __enter__(self) -> FakeClient:
-        return self
-
-    def __exit__(self, *reason: object) -> None:
-        pass
-
-    def scheduler_info(self) -> dict[str, Any]:
-        return {"workers": {}}
-
-    def submit(self, function: Any, *arguments: Any, pure: bool) -> FakeFuture:
-        assert not pure
-        self.submitted += 1
-
-        def lose(*_: Any) -> None:
-            raise RuntimeError("the worker is gone")
-
-        return FakeFuture(lose if self.submitted == 3 else function, *arguments)
-
-
 @pytest.fixture
 def fake_dask(monkeypatch: pytest.MonkeyPatch) -> None:
-    worker = types.SimpleNamespace(state=types.SimpleNamespace(nthreads=1000))
-    fake = types.SimpleNamespace(Client=FakeClient, as_completed=list, get_worker=lambda: worker)
-    monkeypatch.setitem(sys.modules, "distributed", fake)
+    monkeypatch.setitem(sys.modules, "distributed", fake_distributed(lost=3))
 
 
 @pytest.mark.usefixtures("fake_runs", "fake_dask")
@@ -296,7 +254,7 @@ def test_a_scheduler_that_does_not_answer_is_an_error(tmp_path: Path, capsys: py
 
 def test_without_dask_the_error_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    case = jobs.plan(STUDIES["gate"], [ROOM], [0], EVERY_FRAME, tmp_path)[0]
+    case = cases.plan(STUDIES["gate"], [ROOM], [0], EVERY_FRAME, tmp_path)[0]
     with pytest.raises(ClusterError, match=r'pip install "tgslam\[cluster\]"'):
         workers.run_on_cluster([case.job], "tcp://here:8786", 0, lambda label: None, lambda job, failure: None)
 
@@ -308,13 +266,13 @@ def test_a_table_has_means_spreads_and_differences(tmp_path: Path) -> None:
     columns = (Column("ate_rmse_cm", "ATE, cm", 2), Column("fps", "frames/s", 1), Column("plane_pq", "PQ", 3))
     variants = (Variant("with", ()), Variant("without", ("loss.gate=false",)))
     study = Study("parts", "Parts", (), variants, columns, ())
-    cases = jobs.plan(study, [ROOM], [0, 1], EVERY_FRAME, tmp_path)
+    planned = cases.plan(study, [ROOM], [0, 1], EVERY_FRAME, tmp_path)
     metrics = {
-        cases[0].job.folder: {"ate_rmse_cm": 1.0, "fps": 3.0, "plane_pq": None},
-        cases[1].job.folder: {"ate_rmse_cm": 2.0, "fps": None},
-        cases[2].job.folder: {"ate_rmse_cm": 1.496},
+        planned[0].job.folder: {"ate_rmse_cm": 1.0, "fps": 3.0, "plane_pq": None},
+        planned[1].job.folder: {"ate_rmse_cm": 2.0, "fps": None},
+        planned[2].job.folder: {"ate_rmse_cm": 1.496},
     }
-    (found,) = table.tabulate(cases, metrics, {cases[3].job.folder: "no luck"})
+    (found,) = table.tabulate(planned, metrics, {planned[3].job.folder: "no luck"})
     assert table.header(found) == ["parts", "ATE, cm", "frames/s", "runs"]
     assert table.rows(found) == [
         ["with", "1.50 ± 0.71", "3.0", "2"],

@@ -345,7 +345,7 @@ def test_graph_reports_every_size(capsys: pytest.CaptureFixture[str]) -> None:
     assert "update of the pose graph" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("benchmark", ["render", "map", "track", "run", "ablation", "graph"])
+@pytest.mark.parametrize("benchmark", ["render", "map", "track", "run", "ablation", "paper", "graph"])
 def test_help(benchmark: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["bench", benchmark, "--help"])

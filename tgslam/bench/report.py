@@ -11,6 +11,7 @@ from typing import Any
 
 import tgslam
 from tgslam.bench.ablation import results as table
+from tgslam.bench.paper import side_by_side
 from tgslam.bench.whole_run import CACHES
 from tgslam.device import runtime
 from tgslam.output.console import print_columns
@@ -129,6 +130,22 @@ def print_ablation(result: dict[str, Any]) -> None:
         print_columns(table.heading(found), table.header(found), table.rows(found))
         for failure in table.failed_runs(found):
             print(f"  failed: {failure}")
+
+
+def print_paper(result: dict[str, Any]) -> None:
+    """The paper's tables of which something is there; below them, what is not there and what failed."""
+    print_machine(result["machine"])
+    for heading, titles, rows in side_by_side.shown(result["tables"]):
+        print()
+        print_columns(heading, titles, rows)
+    if result["identity"] is not None:
+        print()
+        titles, *body = table.identity_rows(result["identity"])
+        print_columns(side_by_side.figure_heading(result["identity"]), titles, body)
+    lines = side_by_side.absent(result["tables"])
+    lines += [f"failed: {failure}" for failure in side_by_side.failed_runs(result["tables"])]
+    for line in lines:
+        print(f"  {line}")
 
 
 def print_graph(result: dict[str, Any]) -> None:

@@ -10,6 +10,7 @@ import traceback
 from collections.abc import Sequence
 
 from tgslam import __version__
+from tgslam.cli import batch_runs as batch
 from tgslam.cli import benchmark as bench
 from tgslam.cli import convert_recording as convert
 from tgslam.cli import doctor, evaluate, render, run
@@ -59,7 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"tgslam {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    for module in (run, evaluate, render, export, probe, convert, bench, doctor):
+    for module in (run, evaluate, render, export, probe, convert, batch, bench, doctor):
         command = module.add_parser(commands)
         add_log_options(command)
         command.set_defaults(execute=module.execute)

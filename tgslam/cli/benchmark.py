@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tgslam.cli import bench_ablation, engine
+from tgslam.cli import bench_ablation, bench_paper, engine
 from tgslam.cli.inputs import open_frames, parse_frames, resolve_config
 from tgslam.cli.options import add_log_options, add_thread_count, positive, size
 from tgslam.errors import ConfigError, EvaluationError
@@ -37,7 +37,15 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
         "by stage; or compare ways of learning which plane is where.",
     )
     benchmarks = parser.add_subparsers(metavar="BENCHMARK", required=True)
-    for add in (_add_render, _add_map, _add_track, _add_run, bench_ablation.add_parser, _add_graph):
+    for add in (
+        _add_render,
+        _add_map,
+        _add_track,
+        _add_run,
+        bench_ablation.add_parser,
+        bench_paper.add_parser,
+        _add_graph,
+    ):
         benchmark = add(benchmarks)
         benchmark.add_argument("--json", action="store_true", help="print everything as JSON instead of tables")
         add_log_options(benchmark, default=argparse.SUPPRESS)
@@ -61,7 +69,7 @@ def _print(result: dict[str, Any]) -> None:
 
     printers = {
         "render": report.print_render, "map": report.print_map, "track": report.print_track, "run": report.print_run,
-        "ablation": report.print_ablation, "graph": report.print_graph,
+        "ablation": report.print_ablation, "paper": report.print_paper, "graph": report.print_graph,
     }  # fmt: skip
     printers[result["benchmark"]](result)
 

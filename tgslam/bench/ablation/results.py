@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from tgslam.bench.ablation.jobs import Case
-
-Metrics = Mapping[Path, dict[str, Any]]  # of the runs that came to their end, by their folders
-Failures = Mapping[Path, str]  # why the others did not
-
-_NO_VALUE = "-"
+from tgslam.bench.ablation.cases import Case
+from tgslam.bench.runs.outcome import Failures, Metrics, markdown_grid, mean_text, outcome, over_seeds
 
 
 def tabulate(cases: Sequence[Case], metrics: Metrics, failures: Failures) -> list[dict[str, Any]]:
@@ -73,7 +68,7 @@ def markdown(tables: Sequence[dict[str, Any]]) -> str:
     """All of them as one page."""
     parts = ["Mean over the seeds, ± their standard deviation, and in brackets the difference to the first row."]
     for table in tables:
-        parts += [f"## {heading(table)}", _grid(header(table), rows(table))]
+        parts += [f"## {heading(table)}", markdown_grid(header(table), rows(table))]
         failures = failed_runs(table)
         if failures:
             parts.append("\n".join(f"- failed: {failure}" for failure in failures))
@@ -103,13 +98,7 @@ def identity_rows(result: dict[str, Any]) -> list[list[str]]:
 def identity_markdown(result: dict[str, Any]) -> str:
     """Its table as a page."""
     titles, *body = identity_rows(result)
-    return f"## {identity_heading(result)}\n\n{_grid(titles, body)}\n"
-
-
-def _grid(titles: list[str], body: list[list[str]]) -> str:
-    """A table in Markdown, numbers to the right."""
-    lines = [titles, ["---", *["---:"] * (len(titles) - 1)], *body]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    return f"## {identity_heading(result)}\n\n{markdown_grid(titles, body)}\n"
 
 
 def _variants(cases: list[Case], keys: list[str], metrics: Metrics, failures: Failures) -> list[dict[str, Any]]:
@@ -117,12 +106,12 @@ def _variants(cases: list[Case], keys: list[str], metrics: Metrics, failures: Fa
     for name, group in groupby(cases, key=lambda case: case.variant.name):
         seeds = list(group)
         reference = found[0]["metrics"] if found else None
-        values = {key: _values([metrics.get(case.job.folder, {}).get(key) for case in seeds]) for key in keys}
+        values = {key: over_seeds([metrics.get(case.job.folder, {}).get(key) for case in seeds]) for key in keys}
         found.append(
             {
                 "name": name,
                 "overrides": list(seeds[0].study.overrides(seeds[0].variant)),
-                "runs": [_run(case, metrics, failures) for case in seeds],
+                "runs": [outcome(case.job, metrics, failures) for case in seeds],
                 "metrics": {
                     key: {**value, "difference": _difference(value, reference and reference[key])}
                     for key, value in values.items()
@@ -132,22 +121,6 @@ def _variants(cases: list[Case], keys: list[str], metrics: Metrics, failures: Fa
     return found
 
 
-def _run(case: Case, metrics: Metrics, failures: Failures) -> dict[str, Any]:
-    folder = case.job.folder
-    state = "finished" if folder in metrics else "failed" if folder in failures else "missing"
-    return {"seed": case.seed, "folder": str(folder), "state": state, "message": failures.get(folder)}
-
-
-def _values(values: list[float | None]) -> dict[str, Any]:
-    """values: by seed; null where a run failed or the metric does not apply."""
-    known = [value for value in values if value is not None]
-    return {
-        "values": values,
-        "mean": statistics.fmean(known) if known else None,
-        "spread": statistics.stdev(known) if len(known) > 1 else None,
-    }
-
-
 def _difference(value: dict[str, Any], reference: dict[str, Any] | None) -> float | None:
     if reference is None or value["mean"] is None or reference["mean"] is None:
         return None
@@ -155,12 +128,9 @@ def _difference(value: dict[str, Any], reference: dict[str, Any] | None) -> floa
 
 
 def _cell(value: dict[str, Any], digits: int) -> str:
-    if value["mean"] is None:
-        return _NO_VALUE
-    spread = "" if value["spread"] is None else f" ± {value['spread']:.{digits}f}"
     shift = value["difference"]
     difference = "" if shift is None else f" ({round(shift, digits) + 0.0:+.{digits}f})"  # never -0.00
-    return f"{value['mean']:.{digits}f}{spread}{difference}"
+    return f"{mean_text(value, digits)}{difference}"
 
 
 def _runs(variant: dict[str, Any]) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from tgslam.bench.ablation.jobs import Job
+from tgslam.bench.runs.jobs import Job
 from tgslam.bench.whole_run import child_environment
 from tgslam.config.loader import dump
 from tgslam.device.runtime import available_threads
@@ -32,21 +32,27 @@ _log = logging.getLogger(__name__)
 def run_here(jobs: Sequence[Job], at_once: int, threads: int, began: Callable[[str], None], ended: Ended) -> None:
     """Do the runs on this machine, `at_once` at a time.
 
-    threads: of each; 0 = a fair share of the cores. When this raises, KeyboardInterrupt too, the runs that have not
-    ended are killed, and begin anew next time.
+    threads: of each; 0 = a fair share of the cores. A run that is killed, for want of memory say, begins anew once.
+    When this raises, KeyboardInterrupt too, the runs that have not ended are killed, and begin anew next time.
     """
-    waiting, running = deque(jobs), list[_Process]()
+    waiting, running, anew = deque(jobs), list[_Process](), set[Path]()
     share = threads or max(1, available_threads() // max(1, min(at_once, len(jobs))))
     try:
         while waiting or running:
             while waiting and len(running) < at_once:
                 job = waiting.popleft()
-                began(job.label)
+                if job.folder not in anew:
+                    began(job.label)
                 running.append(_Process(job, share))
             for process in [process for process in running if process.has_ended()]:
                 running.remove(process)
                 with process:
-                    ended(process.job, process.failure())
+                    if process.was_killed() and process.job.folder not in anew:
+                        _log.warning("%s was killed; it begins anew", process.job.label)
+                        anew.add(process.job.folder)
+                        waiting.append(process.job)
+                    else:
+                        ended(process.job, process.failure())
             time.sleep(_POLL_S)
     finally:
         for process in running:
@@ -80,9 +86,13 @@ def run_on_cluster(jobs: Sequence[Job], address: str, threads: int, began: Calla
 
 
 def run_on_worker(job: Job, threads: int) -> str | None:
-    """Do one run on a Dask worker and return None, or why it failed."""
+    """Do one run on a Dask worker, once more if it is killed, and return None, or why it failed."""
     if not threads:
         threads = max(1, available_threads() // max(1, int(_distributed().get_worker().state.nthreads)))
+    with _Process(job, threads) as process:
+        process.wait()
+        if not process.was_killed():
+            return process.failure()
     with _Process(job, threads) as process:
         process.wait()
         return process.failure()
@@ -93,7 +103,7 @@ class _Process:
 
     def __init__(self, job: Job, threads: int) -> None:
         self.job = job
-        self._scratch = tempfile.TemporaryDirectory(prefix="tgslam-ablation-")
+        self._scratch = tempfile.TemporaryDirectory(prefix="tgslam-job-")
         folder = Path(self._scratch.name)
         self._errors = folder / "stderr.txt"
         write_text(folder / "config.yaml", dump(job.config))
@@ -111,6 +121,11 @@ class _Process:
     def wait(self) -> None:
         """Return when it has ended."""
         self._process.wait()
+
+    def was_killed(self) -> bool:
+        """Whether a signal ended it, of which there are none on Windows."""
+        code = self._process.poll()
+        return code is not None and code < 0
 
     def failure(self) -> str | None:
         """Why the run failed, once it has ended; None if it did not."""

@@ -1,0 +1,1 @@
+"""Runs in processes of their own, each in a folder that its settings name: what studies, tables and batches share."""
