@@ -97,6 +97,13 @@ def test_run_writes_the_whole_folder(world: World, capsys: pytest.CaptureFixture
     assert "\x1b" not in out + err
 
 
+@pytest.mark.usefixtures("world")
+@pytest.mark.parametrize(("quality", "budget"), [("fast", 0.5), ("normal", 1.0), ("high", 5.0)])
+def test_quality_is_a_budget_of_refinement(quality: str, budget: float) -> None:
+    assert main(["run", "--output", "out", "--quality", quality, "--quiet"]) == 0
+    assert load(Path("out") / "config.yaml").mapping.budget == budget
+
+
 def test_run_without_arguments_takes_the_built_in_scene_into_a_fresh_folder(world: World) -> None:
     assert main(["run", "--quiet"]) == 0
     world.system = FakeSystem()

@@ -282,6 +282,29 @@ def test_the_final_refinement_sharpens_frames_that_mapping_never_saw(source: Syn
     assert all((k.T_cw == T_cw).all() for k, T_cw in zip(mapper.keyframes, poses, strict=True))
 
 
+@pytest.mark.parametrize(
+    ("settings", "steps"),
+    [
+        ({"final_iterations": 1}, 6),  # final_rounds for each of the three
+        ({"final_iterations": 7}, 9),  # whole rounds
+        ({"final_iterations": 7, "budget": 2.0}, 15),
+        ({"final_iterations": 7, "budget": 0.5}, 6),
+        ({"final_iterations": 0}, 0),
+    ],
+)
+def test_every_keyframe_has_its_turns_in_the_final_pass(
+    source: SyntheticSource, monkeypatch: pytest.MonkeyPatch, settings: dict[str, float], steps: int
+) -> None:
+    mapper = mapped(source, range(0, 30, 10), iterations=0, final_rounds=2, **settings)
+    seen: list[int] = []
+    monkeypatch.setattr(
+        mapper.refinement.refiner, "step", lambda keyframe, *, colour_pace, final: seen.append(keyframe.index)
+    )
+    mapper.refinement.finish()
+    assert len(seen) == steps
+    assert len(set(np.unique(seen, return_counts=True)[1].tolist())) <= 1
+
+
 def unseen_psnr(mapper: Mapper, source: SyntheticSource) -> float:
     frames = [source.clean(index) for index in (5, 15)]
     return float(np.mean([psnr(view(mapper, true_T_cw(source, f.index)).colour, f.colour) for f in frames]))

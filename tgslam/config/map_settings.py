@@ -152,7 +152,7 @@ class MappingConfig:
         4, 0, 100_000, doc="In the end every keyframe gets so many steps at least; with final_iterations: 0 none."
     )
     budget: float = setting(
-        1.0, 0.0, 1000.0, doc="What all these steps are multiplied by: time for sharpness, see docs/experiments.md."
+        1.0, 0.0, 1000.0, doc="What all these steps are multiplied by: time for sharpness, as `--quality`."
     )
     refine_poses: bool = setting(
         False,
