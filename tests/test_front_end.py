@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tgslam.camera import Camera
 from tgslam.config.input_settings import SyntheticConfig
 from tgslam.config.schema import Config
+from tgslam.config.tracking_settings import TrackingConfig
 from tgslam.datasets.built_in import SyntheticSource
 from tgslam.geometry import inverse, se3_exp
 from tgslam.map.keyframes import Keyframe
@@ -188,10 +189,14 @@ def x_of(T_cw: NDArray[np.float64]) -> float:
 
 
 def tracked(
-    drawn_to: list[float], predicted_m: float, latest_m: float = 0.0, number: int = 0
+    drawn_to: list[float],
+    predicted_m: float,
+    latest_m: float = 0.0,
+    number: int = 0,
+    tracking: TrackingConfig = CONFIG.tracking,
 ) -> tuple[TrackingResult, FakeTracker]:
     """Of a frame that is predicted somewhere along x; a keyframe shows frame 0, where x is 0."""
-    front_end, fake = FrontEnd(source().camera, CONFIG.tracking, CONFIG.loss, CONFIG.poses), FakeTracker(drawn_to)
+    front_end, fake = FrontEnd(source().camera, tracking, CONFIG.loss, CONFIG.poses), FakeTracker(drawn_to)
     front_end.tracker = fake  # type: ignore[assignment]
     there = inverse(source().pose(0))
     front_end._motion.update(0.0, at(predicted_m) @ there, 1e12 * np.eye(6))
@@ -222,6 +227,12 @@ def test_where_alignment_leads_away_from_the_place_the_frame_is_there_all_the_sa
 def test_a_frame_that_nothing_is_recognised_in_is_as_aligned() -> None:
     found, _ = tracked([1.0], predicted_m=1.0, number=540)
     assert not found.lost and x_of(found.T_cw) == pytest.approx(1.0)
+
+
+def test_without_recognition_a_frame_is_as_aligned() -> None:
+    found, fake = tracked([1.0, 0.001], predicted_m=1.0, tracking=replace(CONFIG.tracking, recognition=False))
+    assert not found.lost and x_of(found.T_cw) == pytest.approx(1.0)
+    assert fake.asked == [1.0] and fake.accepted == 1
 
 
 def test_fallbacks_are_tried_until_one_holds() -> None:

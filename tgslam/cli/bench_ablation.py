@@ -32,7 +32,8 @@ def add_parser(benchmarks: Any) -> argparse.ArgumentParser:
         help="the method with parts of it left out",
         description="Compare runs with parts of the method left out, study by study: interval (structure closures at "
         "every k-th keyframe, Table 4), structure (planes and closures, Table 5), gate (the texture gate), terms (SSIM "
-        "and gradient of the objective), viewpoints (sparse global viewpoints); and identity (instance colours against "
+        "and gradient of the objective), viewpoints (sparse global viewpoints), recordings (exposure, recognition, "
+        "closures, the sensor), quality (time for refinement); and identity (instance colours against "
         "scalar ids on one frame, Fig. 6). Tables go to stdout and, as Markdown and JSON, into --output. Runs that are "
         "finished there with the same settings are not done again.",
     )
